@@ -32,16 +32,9 @@ def write_json(path: Path, data: object) -> None:
 
 
 def read_json(path: Path, *, max_bytes: int = MAX_BYTES, finite: bool = False) -> Any:
-    """Parse a JSON file.
+    """Parse a JSON file in UTF-8 of at most `max_bytes`; `finite` refuses NaN and Infinity, which JSON does not have.
 
-    Args:
-        path: the file, UTF-8.
-        max_bytes: refuse a larger file.
-        finite: refuse NaN and Infinity, which Python writes although JSON has no such numbers.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: as of `parse_json`; the message names the file.
+    FileNotFoundError: no such file. ValueError: as of `parse_json`; the message names the file.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file, expected JSON")
@@ -52,17 +45,10 @@ def read_json(path: Path, *, max_bytes: int = MAX_BYTES, finite: bool = False) -
 
 
 def parse_json(where: str, content: bytes, *, max_bytes: int = MAX_BYTES, finite: bool = False) -> Any:
-    """Parse JSON in UTF-8; the caller has to check the type of what it uses.
+    """Parse JSON in UTF-8; the caller has to check the type of what it uses. `where` names the content in messages.
 
-    Args:
-        where: name of the content, for messages.
-        content: the bytes to parse.
-        max_bytes: refuse longer content.
-        finite: refuse NaN and Infinity, which Python writes although JSON has no such numbers.
-
-    Raises:
-        ValueError: the content is too long, has more than 500,000 lists and objects, is nested deeper than 64 levels,
-            or is not JSON.
+    ValueError: the content is too long, has more than 500,000 lists and objects, is nested deeper than 64 levels, or is
+    not JSON.
     """
     if len(content) > max_bytes:
         raise ValueError(f"{where}: expected at most {max_bytes:,} bytes of JSON, got {len(content):,}")
@@ -79,11 +65,7 @@ def parse_json(where: str, content: bytes, *, max_bytes: int = MAX_BYTES, finite
 
 
 def read_object(path: Path, *, finite: bool = False) -> JsonObject:
-    """Parse a JSON file that holds an object; arguments and errors are those of `read_json`.
-
-    Raises:
-        FormatError: the file holds another kind of value.
-    """
+    """Parse a JSON file as `read_json` does; FormatError if it holds no object."""
     data: Json = read_json(path, finite=finite)
     if not isinstance(data, dict):
         raise FormatError(f"{path}: expected a JSON object, got {type(data).__name__}")

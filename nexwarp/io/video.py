@@ -16,16 +16,10 @@ from nexwarp.io.files import one_line, written_aside
 if TYPE_CHECKING:
     import av
 
-# Encoder and its options: constant quality, without visible artefacts.
+KINDS = {".mp4": "mp4", ".mov": "mov", ".mkv": "matroska", ".webm": "webm"}  # suffix -> container
+# Encoders and their options: constant quality, without visible artefacts.
 H264 = ("libx264", {"crf": "16", "preset": "medium"})
-
-# Suffix -> container, its options, encoder, its options.
-KINDS: dict[str, tuple[str, dict[str, str], str, dict[str, str]]] = {
-    ".mp4": ("mp4", {"movflags": "faststart"}, *H264),  # a browser can play the file while it loads
-    ".mov": ("mov", {"movflags": "faststart"}, *H264),
-    ".mkv": ("matroska", {}, *H264),
-    ".webm": ("webm", {}, "libvpx-vp9", {"crf": "24", "b": "0"}),
-}
+VP9 = ("libvpx-vp9", {"crf": "24", "b": "0"})
 
 LARGEST_SIDE = 16384
 BT709, LIMITED_RANGE = 1, 1  # codes of ISO/IEC 23091-2
@@ -55,18 +49,11 @@ def video_writer(
 ) -> Iterator[Callable[[torch.Tensor], None]]:
     """Yield a function that appends an (H, W, 3) uint8 frame; the video is complete at `path` when the block ends.
 
-    The video uses BT.709 colours and 4:2:0 chroma, which all players support. 4:2:0 needs even sizes: the last column
-    or row of an odd size is cropped.
+    The file is .mp4, .mov, .mkv (H.264) or .webm (VP9), written atomically, of BT.709 colours and 4:2:0 chroma, which
+    all players support. 4:2:0 needs even sizes: the last column or row of an odd size is cropped.
 
-    Args:
-        path: .mp4, .mov, .mkv (H.264) or .webm (VP9); written atomically.
-        width: of the frames, pixels.
-        height: of the frames, pixels.
-        fps: frames a second.
-
-    Raises:
-        ValueError: an invalid suffix, size or rate, PyAV (extra `video`) is missing, or the block appended no frame.
-        OSError: `path` cannot be written.
+    ValueError: an invalid suffix, size or rate, PyAV (extra `video`) is missing, or the block appended no frame.
+    OSError: `path` cannot be written.
     """
     check_video(path, fps)
     import av
@@ -74,11 +61,13 @@ def video_writer(
 
     check_range("width", width, 2, LARGEST_SIDE)
     check_range("height", height, 2, LARGEST_SIDE)
-    container_name, container_options, encoder, options = KINDS[Path(path).suffix.lower()]
+    kind = KINDS[Path(path).suffix.lower()]
+    encoder, options = VP9 if kind == "webm" else H264
+    while_it_loads = {"movflags": "faststart"} if kind in ("mp4", "mov") else {}  # a browser can play it
     even = (height // 2 * 2, width // 2 * 2)
     count = 0
     with written_aside(path) as temporary:
-        with av.open(str(temporary), "w", format=container_name, options=container_options) as container:
+        with av.open(str(temporary), "w", format=kind, options=while_it_loads) as container:
             rate = Fraction(fps).limit_denominator(1001)
             stream = container.add_stream(encoder, rate=rate, options=options)
             assert isinstance(stream, av.VideoStream)
@@ -89,11 +78,6 @@ def video_writer(
 
             def append(frame: torch.Tensor) -> None:
                 nonlocal count
-                if frame.dtype != torch.uint8 or tuple(frame.shape) != (height, width, 3):
-                    raise ValueError(
-                        f"frame: expected uint8 of shape ({height}, {width}, 3), got {frame.dtype} of "
-                        f"{tuple(frame.shape)}"
-                    )
                 pixels = frame[: even[0], : even[1]].cpu().contiguous().numpy()
                 picture = av.VideoFrame.from_ndarray(pixels, format="rgb24").reformat(
                     format="yuv420p",
@@ -114,9 +98,8 @@ def video_writer(
 def read_frames(path: str | os.PathLike[str]) -> Iterator["av.VideoFrame"]:
     """Decode the frames of a video's first video stream, in the order in which they are shown.
 
-    Raises:
-        SettingError: PyAV (extra `video`) is missing.
-        FormatError: the file is no video, has no video stream, or is damaged.
+    SettingError: PyAV (extra `video`) is missing. FormatError: the file is no video, has no video stream, or is
+    damaged.
     """
     _check_av(path)
     import av

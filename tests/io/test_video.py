@@ -69,8 +69,6 @@ def test_failure_leaves_the_old_video_and_nothing_else(tmp_path: Path) -> None:
         raise RuntimeError("half way")
     with pytest.raises(ValueError, match=r"a\.mp4: expected at least one frame, got none"), video_writer(path, 32, 32):
         pass
-    with pytest.raises(RuntimeError), video_writer(tmp_path / "new" / "b.mp4", 32, 32):
-        raise RuntimeError
     assert path.read_bytes() == b"old" and [f.name for f in tmp_path.iterdir()] == ["a.mp4"]
 
 
@@ -83,13 +81,6 @@ def test_wrong_inputs_are_named(tmp_path: Path) -> None:
             check_video(tmp_path / "a.mp4", fps)
     with pytest.raises(ValueError, match="height: expected at least 2"), video_writer(tmp_path / "a.mp4", 32, 1):
         pass
-    with (
-        pytest.raises(
-            ValueError, match=r"frame: expected uint8 of shape \(32, 32, 3\), got torch.uint8 of \(4, 4, 3\)"
-        ),
-        video_writer(tmp_path / "a.mp4", 32, 32) as append,
-    ):
-        append(torch.zeros(4, 4, 3, dtype=torch.uint8))
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file"), video_writer(tmp_path / "file" / "a.mp4", 32, 32):
         pass
