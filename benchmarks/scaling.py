@@ -30,9 +30,7 @@ from nexwarp.run.evaluate import evaluate
 from nexwarp.train.densify import split_surfels
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.ranks.launch import launch
-from nexwarp.train.ranks.ranks import Ranks
-from nexwarp.train.ranks.reducer import GradientReducer
-from nexwarp.train.ranks.shared import shared_scene
+from nexwarp.train.ranks.ranks import GradientReducer, Ranks
 from nexwarp.train.recipe import DEMO_SETTINGS, Config, preset
 from nexwarp.train.settings import parse_settings, with_settings
 from nexwarp.train.trainer import Trainer
@@ -95,9 +93,9 @@ def work(options: Scaling) -> None:
         torch.cuda.set_device(device)
         wp.set_device(f"cuda:{local}")
     backend = options.backend or ("gloo" if options.share_gpu else None)
-    with Ranks.join(device, {}, backend=backend) as ranks:
+    with Ranks.join(device, backend=backend) as ranks:
         folder = demo_folder() if options.scene == DEMO else options.scene
-        scene = shared_scene(lambda: load_scene(folder), ranks)
+        scene = load_scene(folder)
         for mode in options.modes if device.type == "cuda" else ("eager",):
             if mode == "captured" and ranks.backend != "nccl":
                 continue
@@ -171,7 +169,8 @@ def step_ms(trainer: Trainer, steps: int) -> float:
     times = []
     for chunk in range(CHUNKS + 1):  # the first one captures graphs
         synchronize(trainer.device)
-        trainer.ranks.barrier()
+        if isinstance(trainer, ParallelTrainer):
+            trainer.ranks.barrier()
         start = time.perf_counter()
         for _ in range(max(steps // CHUNKS, 1)):
             trainer.step()

@@ -27,7 +27,7 @@ def main(folder: str, backend: str, iterations: int, surfels: int) -> None:
     torch.cuda.set_device(device)
     wp.set_device(f"cuda:{local}")
     scene = nw.load_scene(folder)
-    with Ranks.join(device, {}, backend=backend) as ranks:
+    with Ranks.join(device, backend=backend) as ranks:
         for mode in ("eager", "captured", "beside") if backend == "nccl" else ("eager", "beside"):
             trainer = trained(scene, ranks, mode, iterations, surfels)
             told = {

@@ -20,8 +20,7 @@ from nexwarp.data import Scene
 from nexwarp.kernels.launch import set_num_threads
 from nexwarp.model.model import Model
 from nexwarp.train.parallel import ParallelTrainer
-from nexwarp.train.ranks.ranks import Ranks
-from nexwarp.train.ranks.reducer import GradientReducer
+from nexwarp.train.ranks.ranks import GradientReducer, Ranks
 from nexwarp.train.recipe import Config
 from nexwarp.train.trainer import Trainer
 from tests.trainer_support import state_of
@@ -103,7 +102,7 @@ def run_ranks(size: int, work: Callable[[Ranks], object], folder: Path) -> list[
     """Let ranks do some work, and return what it returned on each, as JSON."""
 
     def joined(rank: int) -> int:
-        with Ranks.join(CPU, {}) as ranks:
+        with Ranks.join(CPU) as ranks:
             found = work(ranks)
         (folder / f"{rank}.json").write_text(json.dumps(found))
         return 0

@@ -9,6 +9,6 @@
 resumed. `--variant inner` holds out every 8th training photo in place of the test views, to choose settings by. `table`
 prints means over seeds. `publish` fills the marked blocks of the documents.
 
-Metrics are those of `nexwarp.run.metrics`; LPIPS needs the weights of VGG and is left out where they cannot be had.
+Metrics are those of `nexwarp.run.evaluate`; LPIPS needs the weights of VGG and is left out where they cannot be had.
 Speed and memory of a training count only when it ran alone (`--jobs 1`).
 """

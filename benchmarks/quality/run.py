@@ -16,7 +16,7 @@ from benchmarks.timing import git_commit
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
-from nexwarp.run.metrics import METRICS, psnr
+from nexwarp.run.evaluate import METRICS, psnr
 from nexwarp.train.stages import student_trainer
 
 RenderImage = Callable[[Camera], torch.Tensor]  # (H, W, 3), not clamped, on any device

@@ -17,9 +17,8 @@ from nexwarp.cli.options import Device_, Flag_, Preset_, Run_, check_max_hits, o
 from nexwarp.data.sfm import SfmOptions, reconstruct
 from nexwarp.model.detail import check_detail
 from nexwarp.run import warmup
-from nexwarp.run.contents import RENDERS_FOLDER
 from nexwarp.run.export import ExportOrder, export_run
-from nexwarp.run.folder import read_metrics
+from nexwarp.run.folder import RENDERS_FOLDER, read_metrics
 from nexwarp.run.opened import OpenedModel, open_model
 from nexwarp.run.render import RenderOrder
 from nexwarp.train.recipe import preset

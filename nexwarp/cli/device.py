@@ -1,15 +1,16 @@
 """Choice and set-up of the device that a command runs on."""
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 import warp as wp
 
-from nexwarp.errors import SettingError
+from nexwarp.cli import __version__
+from nexwarp.errors import RankError, SettingError
 from nexwarp.kernels.launch import get_num_threads, set_num_threads
-from nexwarp.train.ranks.join import Place, code_digest, is_rank
-from nexwarp.train.ranks.launch import check_count
+from nexwarp.train.ranks.launch import check_count, is_rank
 from nexwarp.train.ranks.ranks import Ranks
 
 
@@ -36,22 +37,19 @@ def joined_ranks(name: str | None, gpus: int | None) -> Iterator[Ranks]:
             check_count(gpus, name)
         yield Ranks.alone(pick_device(name))
         return
-    place = Place.of_environment()
-    if gpus not in (None, place.size):
-        raise SettingError(f"--gpus: expected {place.size}, as many as torchrun has started, got {gpus}")
-    facts = {"code of nexwarp": code_digest(), "version of torch": torch.__version__, "version of Warp": wp.__version__}
-    device = pick_device(name)
-    fault = None
-    if device.type == "cuda" and place.local_rank >= (count := torch.cuda.device_count()):
-        fault = f"rank {place.rank}: expected a GPU of its own, but {count} are there for {place.local_size} ranks"
-    elif device.type == "cuda":
-        torch.cuda.set_device(place.local_rank)
-        wp.set_device(f"cuda:{place.local_rank}")
-        properties = torch.cuda.get_device_properties(place.local_rank)
-        facts["GPU"] = f"{properties.name} with {properties.total_memory / 2**30:.0f} GiB"
+    if gpus not in (None, int(os.environ["WORLD_SIZE"])):
+        raise SettingError(f"--gpus: expected {os.environ['WORLD_SIZE']}, as many as torchrun has started, got {gpus}")
+    local_rank = int(os.environ.get("LOCAL_RANK", os.environ["RANK"]))
+    local_size = int(os.environ.get("LOCAL_WORLD_SIZE", os.environ["WORLD_SIZE"]))
+    if pick_device(name).type == "cpu":
+        set_num_threads(max(1, get_num_threads() // local_size))
+    elif local_rank >= (count := torch.cuda.device_count()):
+        raise RankError(
+            f"rank {os.environ['RANK']}: expected a GPU of its own, but {count} are there for {local_size} ranks"
+        )
     else:
-        facts["device"] = "a CPU"
-        set_num_threads(max(1, get_num_threads() // place.local_size))
-    hint = "; --resume continues from the last checkpoint"
-    with Ranks.join(pick_device(name), facts, fault=fault, hint=hint) as ranks:
+        torch.cuda.set_device(local_rank)
+        wp.set_device(f"cuda:{local_rank}")
+    with Ranks.join(pick_device(name)) as ranks:
+        ranks.check_same({"nexwarp": __version__, "torch": torch.__version__, "Warp": wp.__version__})
         yield ranks

@@ -17,11 +17,9 @@ from nexwarp.data.scene import SceneSource
 from nexwarp.errors import MissingError, SceneError
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.model.model import Model
-from nexwarp.run.contents import METRICS_FILE, RENDERS_FOLDER
-from nexwarp.run.evaluate import evaluate
+from nexwarp.run.evaluate import check_metrics, evaluate
 from nexwarp.run.fit_poses import fit_poses
-from nexwarp.run.folder import locked_run, read_metrics
-from nexwarp.run.metrics import check_metrics
+from nexwarp.run.folder import METRICS_FILE, RENDERS_FOLDER, locked_run, read_metrics
 from nexwarp.run.opened import OpenedModel, open_model
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import MASK_MODES

@@ -21,10 +21,9 @@ from nexwarp.cli.process import Process
 from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.cli.view import ViewCommand
-from nexwarp.errors import NexwarpError
+from nexwarp.errors import NexwarpError, RankError
 from nexwarp.machine import needed_memory
-from nexwarp.train.ranks.launch import launch
-from nexwarp.train.ranks.liveness import end_process, may_speak
+from nexwarp.train.ranks.launch import end_process, launch, may_speak
 
 PROGRAM = ("-m", "nexwarp")  # what the ranks of a training run
 CLOSED_PIPE = 128 + 13  # SIGPIPE, which other systems do not have
@@ -61,7 +60,7 @@ def _parse(arguments: list[str]) -> Callable[[Console], None]:
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         close = get_close_matches(arguments[0], COMMANDS, n=1, cutoff=0.5)
         meant = f"; perhaps you meant nexwarp {close[0]}" if close else ""
-        _complain(f"error: no command {arguments[0]!r:.60}, expected one of {', '.join(COMMANDS)}{meant}", None)
+        _complain(f"error: no command {arguments[0]!r:.60}, expected one of {', '.join(COMMANDS)}{meant}")
         raise SystemExit(2)
     try:
         with redirect_stderr(message):
@@ -76,7 +75,7 @@ def _parse(arguments: list[str]) -> Callable[[Console], None]:
     except SystemExit as stop:
         if stop.code:
             help_of = f"nexwarp {arguments[0]}" if arguments and arguments[0] in COMMANDS else "nexwarp"
-            _complain(f"error: {_unboxed(message.getvalue(), help_of)}; see {help_of} --help", None)
+            _complain(f"error: {_unboxed(message.getvalue(), help_of)}; see {help_of} --help")
         raise
 
 
@@ -107,12 +106,9 @@ def _unboxed(text: str, command: str) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return its exit code.
 
-    0: success. 2: invalid input, a full disk or a diverged training. 3: an internal error, or a fault of the GPU. 128
-    plus the signal's number: ended by Ctrl-C (130), SIGTERM (143) or SIGHUP (129), or because nobody reads its output
-    any more (141, as of SIGPIPE). Every failure but the last prints one line on stderr.
-
-    Args:
-        arguments: command line without the program's name; None takes that of the process.
+    0: success. 2: invalid input, a full disk or a diverged training. 3: an internal error, a fault of the GPU, or of
+    ranks. 128 plus the signal's number: ended by Ctrl-C (130), SIGTERM (143) or SIGHUP (129), or because nobody reads
+    its output any more (141, as of SIGPIPE). Every failure but the last prints one line on stderr.
     """
     import warp as wp
 
@@ -150,7 +146,7 @@ def _run(words: list[str]) -> int:
     except KeyboardInterrupt as stop:
         number = getattr(stop, "number", signal.SIGINT)
         hint = "; continue with --resume" if isinstance(command, Train) else ""
-        _complain(f"{'interrupted' if number == signal.SIGINT else 'terminated'}{hint}", None)
+        _complain(f"{'interrupted' if number == signal.SIGINT else 'terminated'}{hint}", stop)
         return end_process(128 + number)
     except Exception as error:
         return end_process(_tell(error, command, debug))
@@ -159,28 +155,27 @@ def _run(words: list[str]) -> int:
 
 def _tell(error: Exception, command: Callable[[Console], None], debug: bool) -> int:
     """Print one line about an error; return the exit code."""
-    trace = error if debug else None
+    hint = "; --resume continues from the last checkpoint" if isinstance(command, Train) else ""
+    text, code = f"error: {error}", 2
     if (needed := needed_memory(error)) is not None and not isinstance(error, NexwarpError):
-        _complain(f"error: out of memory: needed {needed}; try a smaller image size", trace)
-        return 2
-    if isinstance(error, (NexwarpError, ValueError, OSError)):
-        _complain(f"error: {error}", trace)
-        return 2
-    if isinstance(error, RuntimeError) and (fault := re.match(r"(Warp )?CUDA error\b[^\n]*", str(error))):
-        hint = "; --resume continues from the last checkpoint" if isinstance(command, Train) else ""
-        _complain(f"error: the GPU failed ({fault[0]}){hint}", trace)
-        return 3
-    hint = "" if debug else "; --debug shows the traceback"
-    _complain(f"internal error: {type(error).__name__}: {error}{hint}", trace)
-    return 3
+        text = f"error: out of memory: needed {needed}; try a smaller image size"
+    elif isinstance(error, RankError):
+        code = 3
+    elif isinstance(error, RuntimeError) and (fault := re.match(r"(Warp )?CUDA error\b[^\n]*", str(error))):
+        text, code = f"error: the GPU failed ({fault[0]}){hint}", 3
+    elif not isinstance(error, (NexwarpError, ValueError, OSError)):
+        hint = "" if debug else "; --debug shows the traceback"
+        text, code = f"internal error: {type(error).__name__}: {error}{hint}", 3
+    _complain(text, error, debug=debug)
+    return code
 
 
-def _complain(text: str, trace: Exception | None) -> None:
-    """Print one line on stderr, below the traceback of an error if one is given; of several ranks, one does."""
-    if not may_speak():
+def _complain(text: str, error: BaseException | None = None, *, debug: bool = False) -> None:
+    """Print one line on stderr, below the traceback with `debug`; of several ranks, one does."""
+    if not may_speak(error):
         return
-    if trace is not None:
-        traceback.print_exception(trace)
+    if debug and error is not None:
+        traceback.print_exception(error)
     line = " ".join(f"nexwarp: {text}".split())
     Console(stderr=True, soft_wrap=True, highlight=False).print(line, markup=False)
 

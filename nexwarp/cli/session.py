@@ -20,18 +20,22 @@ from nexwarp.io.json_files import Json, write_json
 from nexwarp.machine import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, load, save_model
-from nexwarp.run.contents import (
+from nexwarp.run.evaluate import evaluate
+from nexwarp.run.folder import (
     COMPARE,
     DIVERGED_FILE,
     METRICS_FILE,
     RENDERS_FOLDER,
     TRAIN,
+    RunRecord,
+    create_run,
+    is_run,
     picture_name,
+    read_metrics,
+    read_run,
     remove_leftovers,
     teacher_folder,
 )
-from nexwarp.run.evaluate import evaluate
-from nexwarp.run.folder import RunRecord, create_run, is_run, read_metrics, read_run
 from nexwarp.run.log import TrainingLog
 from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
@@ -142,7 +146,7 @@ class Session:
                 if self.ranks.size == 1:
                     number = stop_signal()  # also one that came during the save
                 if number is not None:
-                    self.ranks.leave_together()
+                    self.ranks.barrier()
                     raise Stopped(number)
 
             def warn(text: str) -> None:
@@ -201,7 +205,7 @@ class Session:
         except OSError as problem:
             outcome = f"the model of iteration {trainer.iteration:,} could not be saved ({problem})"
         outcome = str(self.ranks.share(outcome))
-        self.ranks.leave_together()
+        self.ranks.barrier()
         return DivergedError(f"{error}; {outcome}", report)
 
     def _write(self, stage: Stage, trainer: Trainer) -> Model:

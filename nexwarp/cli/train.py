@@ -24,7 +24,6 @@ from nexwarp.io.json_files import Json
 from nexwarp.model.model_file import load
 from nexwarp.run.folder import (
     RunRecord,
-    began,
     check_teachers_place,
     claimed_run,
     create_run,
@@ -34,10 +33,8 @@ from nexwarp.run.folder import (
     update_run,
 )
 from nexwarp.run.log import PACKAGES, check_package
-from nexwarp.train.ranks.join import is_rank
-from nexwarp.train.ranks.launch import check_count
+from nexwarp.train.ranks.launch import check_count, is_rank
 from nexwarp.train.ranks.ranks import Ranks
-from nexwarp.train.ranks.shared import shared_scene
 from nexwarp.train.recipe import DEMO_SETTINGS, Config, preset
 from nexwarp.train.settings import parse_settings, setting, with_settings
 from nexwarp.train.stages import NO_TEACHERS, StageRunner, plan_teachers, stage_runner
@@ -148,19 +145,15 @@ class Train:
                     viewer.finish(f"{record.config.iterations:,} iterations done", lambda: model)
                     show_until_interrupted(viewer, console)
 
-    def _folder_flags(self, run: Path, ranks: Ranks) -> dict[str, bool]:
-        """Whether to resume or to overwrite; ranks that torchrun has restarted go on with the run that they began."""
-        again = ranks.restarted and began(run, ranks.launch)
-        return {"resume": self.resume or again, "overwrite": self.overwrite and not again}
-
     def _plan(self, run: Path, ranks: Ranks, claim: ExitStack, console: Console) -> tuple[RunRecord, bool]:
         """Claim the run folder, on rank 0; return the run, the same on all ranks, and whether to resume it."""
         record = None
         resume = False
         if ranks.first:
             self._check()
-            flags = self._folder_flags(run, ranks)
-            resume = claim.enter_context(claimed_run(run, self.scene, **flags, warn=partial(display.warn, console)))
+            warn = partial(display.warn, console)
+            claimed = claimed_run(run, self.scene, resume=self.resume, overwrite=self.overwrite, warn=warn)
+            resume = claim.enter_context(claimed)
             record = self._record(run, resume, ranks)
         if ranks.size > 1:
             shared = ranks.share(None if record is None else {"run": record.as_dict(), "resume": resume})
@@ -181,7 +174,7 @@ class Train:
                 raise SettingError(f"--teacher: expected another run than {run}, which is written, got {path}")
         if self.teachers and config.refine_poses:
             raise SettingError("--teacher: expected poses that stay as given, got --refine-poses")
-        return RunRecord(self.scene, config, ranks.device.type, ranks.launch, self.teachers)
+        return RunRecord(self.scene, config, ranks.device.type, self.teachers)
 
     def _config(self) -> Config:
         """Return the settings of a new run."""
@@ -278,7 +271,7 @@ class Train:
                 load(path)
             source = SceneSource(str(scene_folder_of(video)))
             run = self.run or Path("runs") / source.name
-            self._record(run, prepare_run(run, source, **self._folder_flags(run, ranks)), ranks)
+            self._record(run, prepare_run(run, source, resume=self.resume, overwrite=self.overwrite), ranks)
             scene_of_video(video, console)
         ranks.barrier()
         return str(scene_folder_of(video))
@@ -328,7 +321,7 @@ def _load_scene(record: RunRecord, ranks: Ranks, console: Console) -> Scene:
     count = f", {ranks.size} ranks" if ranks.size > 1 else ""
     console.print(f"{record.source.name} on {device_name(ranks.device)}{count}, preset {record.config.preset}")
     with display.loading(console) as progress:
-        scene = shared_scene(lambda: record.source.load(progress), ranks)
+        scene = record.source.load(progress)
     size = scene.train[0].camera
     console.print(
         f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "

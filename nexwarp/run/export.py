@@ -19,7 +19,7 @@ from nexwarp.export.mesh import Progress, extract_mesh, save_mesh
 from nexwarp.export.splats_spz import save_splats_spz
 from nexwarp.export.surfels_ply import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_surfels_ply
 from nexwarp.model.model_file import save_model
-from nexwarp.run.contents import EXPORT_FOLDER, EXPORTS, TRAIN
+from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, TRAIN
 from nexwarp.run.opened import OpenedModel
 
 

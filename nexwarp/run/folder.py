@@ -1,14 +1,15 @@
-"""Run folders: creating, locking, checking and reading them.
+"""Run folders: the names of their files, creating, locking, checking and reading them.
 
 A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.json`, `metrics.json`, `metrics.jsonl`,
-`renders/` and `checkpoint/`; `nexwarp.run.contents` has the names, and docs/format.md describes the files.
+`renders/` and `checkpoint/`; docs/format.md describes the files.
 """
 
 import dataclasses
 import errno
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -19,24 +20,80 @@ from typing import Any
 from filelock import BaseFileLock, FileLock, Timeout
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import save_camera_path
+from nexwarp.cameras.paths import PATHS
 from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError, check_version
-from nexwarp.io.files import is_temporary, make_folders, one_line, remove_empty, sync, written_aside
-from nexwarp.io.json_files import READ_ERRORS, Json, parse_json, read_json, write_json
-from nexwarp.run.contents import (
-    CAMERA_PATH,
-    CONFIG_FILE,
-    LOCK_FILE,
-    METRICS_FILE,
-    TEACHERS_FOLDER,
-    delete_files,
-    teacher_folder,
-    teacher_folders,
+from nexwarp.io.files import (
+    is_abandoned,
+    is_temporary,
+    make_folders,
+    one_line,
+    remove_empty,
+    sync,
+    written_aside,
 )
+from nexwarp.io.json_files import READ_ERRORS, Json, parse_json, read_json, write_json
+from nexwarp.model.model_file import MODEL_FILE
+from nexwarp.train.checkpoint import CHECKPOINT_FILES, CHECKPOINTS
 from nexwarp.train.recipe import MIN_SURFELS, MOST_TEACHERS, Config
 from nexwarp.train.settings import config_from_dict
 from nexwarp.train.stages import NO_TEACHERS, OwnTeachers
+
+CONFIG_FILE = "config.json"
+METRICS_FILE = "metrics.json"
+LOG_FILE = "metrics.jsonl"
+DIVERGED_FILE = "diverged.json"
+LOCK_FILE = "run.lock"
+WANDB_FILE = "wandb.json"  # the id of the run at Weights & Biases
+CAMERA_PATH = "camera_path_{}.json"
+ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIVERGED_FILE, LOCK_FILE, WANDB_FILE)
+
+TEACHERS_FOLDER = "teachers"
+TENSORBOARD_FOLDER = "tensorboard"
+EXPORT_FOLDER = "export"
+# The files of each --format of `nexwarp export`.
+EXPORTS = {
+    "ply": ("surfels.ply", "splats.ply"),
+    "mesh": ("mesh.ply",),
+    "compact": ("compact.safetensors",),
+    "cameras": ("transforms.json", "camera_path.json"),
+    "web": ("scene.html",),
+    "glb": ("scene.glb",),
+    "spz": ("splats.spz",),
+}
+
+RENDERS_FOLDER = "renders"
+TRAIN = "train"
+TEST = "test"
+COMPARE = "compare"
+FILE_PATH = "path_{}"  # folder of the frames of a path from a file
+PROJECTIONS = ("panorama", "fisheye", "orthographic")  # folders of the pictures of other cameras than pinholes
+
+FOLDERS = (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER, TEACHERS_FOLDER, RENDERS_FOLDER)
+_ASIDE = r"\.checkpoint\.[^/]*\.tmp"  # a checkpoint that is being written
+
+
+def _any(names: Iterable[str]) -> str:
+    return f"(?:{'|'.join(map(re.escape, names))})"
+
+
+# All files that nexwarp writes, for --overwrite.
+OURS = re.compile(
+    "|".join(
+        [
+            _any(ROOT_FILES),
+            r"camera_path_[1-9]\d*\.json",
+            rf"(?:{_any(CHECKPOINTS)}|{_ASIDE})/{_any(CHECKPOINT_FILES)}",
+            rf"{TENSORBOARD_FOLDER}/events\.out\.tfevents\.[^/]*",
+            rf"{EXPORT_FOLDER}/{_any(name for names in EXPORTS.values() for name in names)}",
+            rf"{RENDERS_FOLDER}/(?:{_any(PROJECTIONS)}/)?{_any((TRAIN, TEST, COMPARE))}/.+\.(?:png|exr)",
+            rf"{RENDERS_FOLDER}/(?:{_any(PROJECTIONS)}/)?(?:{_any(PATHS)}|path_[^/]+)/\d{{4,}}\.(?:png|exr)",
+        ]
+    )
+)
+
 
 RUN_VERSION = 1  # of config.json and metrics.json; a file without `format_version` has version 1
 WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
@@ -45,30 +102,18 @@ MAX_HOLDER = 1000  # bytes of the record of a lock's holder that are read
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What a run's config.json holds: all that the training depends on.
-
-    Attributes:
-        source: the scene.
-        config: the settings.
-        device: type of the device on which the run began.
-        launch: of several ranks, names their start; "" for one process.
-        teachers: folders or files of finished models that the run also learns from.
-        own: teachers that the run trains first.
-    """
+    """What a run's config.json holds: all that the training depends on."""
 
     source: SceneSource
     config: Config
-    device: str = "cpu"
-    launch: str = ""
-    teachers: tuple[Path, ...] = ()
-    own: OwnTeachers = NO_TEACHERS
+    device: str = "cpu"  # type of the device on which the run began
+    teachers: tuple[Path, ...] = ()  # folders or files of finished models that the run also learns from
+    own: OwnTeachers = NO_TEACHERS  # teachers that the run trains first
 
     def as_dict(self) -> dict[str, Json]:
         """Return the entries of config.json; paths are absolute."""
         data: dict[str, Json] = {"scene": dataclasses.asdict(self.source.absolute()), "device": self.device}
         data["config"] = self.config.as_dict()
-        if self.launch:
-            data["launch"] = self.launch
         if self.teachers:
             data["teachers"] = [str(path.resolve()) for path in self.teachers]
         if self.own.count:
@@ -86,17 +131,15 @@ class RunRecord:
         config, own = config_from_dict(data["config"]), _own_teachers(data.get("own_teachers"))
         if own.count * own.iterations >= config.iterations:
             raise ValueError(f"own_teachers: expected fewer iterations than the run's {config.iterations}, got {own}")
-        places = tuple(map(Path, teachers))
-        return cls(source, config, str(data.get("device", "cpu")), str(data.get("launch", "")), places, own)
+        return cls(source, config, str(data.get("device", "cpu")), tuple(map(Path, teachers)), own)
 
 
 def _own_teachers(data: object) -> OwnTeachers:
     if data is None:
         return NO_TEACHERS
-    if not isinstance(data, dict):
-        raise ValueError(f"own_teachers: expected an object, got {data!r:.60}")
-    count, iterations = data.get("count"), data.get("iterations")
-    surfels = data.get("max_surfels")  # None for runs from before teachers had a budget of their own
+    values = data if isinstance(data, dict) else {}
+    count, iterations = values.get("count"), values.get("iterations")
+    surfels = values.get("max_surfels")  # None for runs from before teachers had a budget of their own
     if (
         type(count) is not int
         or type(iterations) is not int
@@ -124,14 +167,6 @@ def read_run(run: Path) -> RunRecord:
 def is_run(folder: Path) -> bool:
     """Whether a folder has the config of a run, which may be damaged."""
     return (folder / CONFIG_FILE).is_file()
-
-
-def began(run: Path, launch: str) -> bool:
-    """Whether a folder holds a run that the ranks of this launch have created."""
-    try:
-        return read_run(run).launch == launch
-    except (FormatError, MissingError):
-        return False
 
 
 def read_metrics(run: Path) -> dict[str, Json]:
@@ -174,23 +209,14 @@ def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool
             f"{run}: expected a new run folder, but it exists; give --resume or --overwrite, or another --run"
         )
     if run.exists() and not empty:
-        _check_replaceable(run)
+        try:
+            read_run(run)
+        except (MissingError, FormatError) as error:
+            raise RunError(
+                f"{run}: expected a run folder to overwrite, and nothing was deleted; give another --run, or delete "
+                f"the folder yourself ({error})"
+            ) from None
     return False
-
-
-def _check_replaceable(run: Path) -> None:
-    """Raise RunError unless a folder holds the config of a run."""
-    try:
-        read_run(run)
-    except MissingError:
-        raise RunError(
-            f"{run}: expected a run folder to overwrite, but it holds no {CONFIG_FILE}; nothing was deleted"
-        ) from None
-    except FormatError as error:
-        raise RunError(
-            f"{run}: expected a run folder to overwrite, but its {CONFIG_FILE} is damaged or not of a run, and nothing "
-            f"was deleted; give another --run, or delete the folder yourself ({error})"
-        ) from None
 
 
 @contextmanager
@@ -295,14 +321,88 @@ def update_run(run: Path, record: RunRecord) -> None:
 
 def check_teachers_place(run: Path, count: int) -> None:
     """Raise RunError where something that is not the run's is where it would put its own teachers; change nothing."""
-    own = teacher_folders(run)
-    for place in (run / TEACHERS_FOLDER, *(teacher_folder(run, number) for number in range(1, count + 1))):
-        taken = place.is_symlink() or (place.exists() and not place.is_dir())
-        if count and (taken or (place.exists() and place.parent != run and place not in own)):
+    places = [TEACHERS_FOLDER, *(f"{TEACHERS_FOLDER}/{number}" for number in range(1, count + 1))]
+    for name in list_files(run)[1] if count else ():
+        if name.rstrip("/") in places:
             raise RunError(
-                f"{place}: expected a teacher's folder or nothing, got what nexwarp did not write; move it, or give "
-                "another --run"
+                f"{run / name}: expected a teacher's folder or nothing, got what nexwarp did not write; move it, or "
+                "give another --run"
             )
+
+
+def picture_name(view: str) -> str:
+    """Return the file name of a view's rendering; a photo in a subfolder gives a name with the subfolder."""
+    return f"{Path(view).with_suffix('')}.png"
+
+
+def teacher_folder(run: Path, number: int) -> Path:
+    """Return the folder of a teacher that a run trains for itself, a run too; teachers are counted from 1."""
+    return run / TEACHERS_FOLDER / str(number)
+
+
+def teacher_folders(run: Path) -> list[Path]:
+    """Return the existing folders of a run's own teachers; its config tells how many it has."""
+    try:
+        count = int(read_json(run / CONFIG_FILE)["own_teachers"]["count"])
+    except (*READ_ERRORS, KeyError, TypeError):  # it has none, or the config is damaged
+        return []
+    folders = [teacher_folder(run, number) for number in range(1, min(count, MOST_TEACHERS) + 1)]
+    return [folder for folder in folders if folder.is_dir() and not (folder.is_symlink() or folder.parent.is_symlink())]
+
+
+def list_files(run: Path) -> tuple[list[str], list[str]]:
+    """Return the files below a run folder that have names of ours, and what else there is; links are not followed.
+
+    Names are relative to the folder. A foreign folder counts as one entry, with a slash at its end.
+    """
+    own: list[str] = []
+    foreign: list[str] = []
+    teachers = [f"{folder.relative_to(run).as_posix()}/" for folder in teacher_folders(run)]
+
+    def in_run(name: str) -> str:
+        return name[len(teachers[0]) :] if name.startswith(tuple(teachers)) else name
+
+    for place, folders, names in os.walk(run):
+        prefix = "" if Path(place) == run else f"{Path(place).relative_to(run).as_posix()}/"
+        for name in [prefix + folder for folder in folders]:
+            top, _, rest = in_run(name).partition("/")
+            may_hold_ours = name + "/" in teachers or top == RENDERS_FOLDER or (not rest and top in FOLDERS)
+            if not (may_hold_ours or re.fullmatch(_ASIDE, top)) or (run / name).is_symlink():
+                foreign.append(name if (run / name).is_symlink() else f"{name}/")
+                folders.remove(Path(name).name)
+        for name in names:
+            ours = is_temporary(name) or OURS.fullmatch(in_run(prefix + name))
+            (own if ours else foreign).append(prefix + name)
+    return sorted(own), sorted(foreign)
+
+
+def delete_files(run: Path, keep: Iterable[str] = ()) -> list[str]:
+    """Delete the files of a run but those to keep, and the folders that this leaves empty; return what is not ours."""
+    own, foreign = list_files(run)
+    folders = {each / name for each in (run, *teacher_folders(run)) for name in FOLDERS}
+    for name in own:
+        if name not in keep:
+            (run / name).unlink()
+            folders |= {run / parent for parent in Path(name).parents[:-1]}
+    remove_empty(sorted(folders, reverse=True))
+    return foreign
+
+
+def remove_leftovers(run: Path) -> None:
+    """Remove the incomplete files that killed processes left; the caller holds the lock of the run folder.
+
+    Pictures, exports and camera paths are written without the lock: a temporary file of these stays while its process
+    may be at work.
+    """
+    folders = {folder for folder in run.iterdir() if re.fullmatch(_ASIDE, folder.name)}
+    for name in list_files(run)[0]:
+        folder, _, base = name.rpartition("/")
+        locked = folder in CHECKPOINTS or (not folder and not base.startswith(".camera_path_"))
+        aside = re.fullmatch(_ASIDE, folder)
+        if aside or (is_temporary(base) and (locked or is_abandoned(run / name))):
+            (run / name).unlink(missing_ok=True)
+            folders |= {run / parent for parent in Path(name).parents[:-1]}
+    remove_empty(sorted(folders, reverse=True))
 
 
 def keep_camera_path(folder: Path, cameras: Sequence[Camera], opened: Path | None = None) -> str:

@@ -15,7 +15,7 @@ import torch
 from nexwarp.errors import SettingError
 from nexwarp.io.files import one_line, written_aside
 from nexwarp.io.json_files import READ_ERRORS, Json, read_object, write_json
-from nexwarp.run.contents import LOG_FILE, TENSORBOARD_FOLDER, WANDB_FILE
+from nexwarp.run.folder import LOG_FILE, TENSORBOARD_FOLDER, WANDB_FILE
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer

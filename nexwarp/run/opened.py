@@ -14,8 +14,7 @@ from nexwarp.errors import FormatError, MissingError
 from nexwarp.model.detail import ORDERED
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load
-from nexwarp.run.contents import CONFIG_FILE
-from nexwarp.run.folder import read_run
+from nexwarp.run.folder import CONFIG_FILE, read_run
 from nexwarp.train.finish.order import ordered
 from nexwarp.train.recipe import Config
 

@@ -24,7 +24,7 @@ from nexwarp.model.buffers import render_buffers, save_buffers
 from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.ops.tiles import Order
-from nexwarp.run.contents import FILE_PATH, PROJECTIONS, RENDERS_FOLDER, TEST, TRAIN, picture_name
+from nexwarp.run.folder import FILE_PATH, PROJECTIONS, RENDERS_FOLDER, TEST, TRAIN, picture_name
 from nexwarp.run.opened import OpenedModel
 
 FRAMES = 120

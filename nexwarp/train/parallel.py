@@ -20,8 +20,7 @@ from nexwarp.machine import derived_seed, needed_memory
 from nexwarp.model.graphs import Gradients, GraphKey, StepResult, UpdateError, capturing
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
-from nexwarp.train.ranks.ranks import Ranks
-from nexwarp.train.ranks.reducer import GradientReducer
+from nexwarp.train.ranks.ranks import GradientReducer, Ranks
 from nexwarp.train.recipe import Config
 from nexwarp.train.relocation import least_contributing
 from nexwarp.train.state import Snapshot
@@ -36,10 +35,9 @@ MOST_CAPTURED_BYTES = 48_000_000
 class ParallelTrainer(Trainer):
     """A training run on several ranks, each of which has one of these; all methods of `Trainer` are collective.
 
-    Views are drawn in one order, which all ranks know, so that each epoch sees each view once. The random numbers of a
-    view follow from the seed and its place in the training, whatever rank renders it. All other choices, such as which
-    surfels split, come from generators that are alike on all ranks. Rank 0 writes and reads checkpoints; a checkpoint
-    can be resumed on any number of ranks.
+    Views are drawn in one order, which all ranks know. The random numbers of a view follow from the seed and its place
+    in the training, whatever rank renders it; other choices come from generators that are alike on all ranks. Rank 0
+    writes and reads checkpoints, which any number of ranks can resume.
     """
 
     def __init__(
@@ -52,19 +50,10 @@ class ParallelTrainer(Trainer):
         beside: bool | None = None,
         **options: Any,
     ) -> None:
-        """Make the same initial surfels and texture on all ranks.
+        """Make the same initial surfels and texture on all ranks, of the same scene, config and options of `Trainer`.
 
-        Args:
-            scene: what to learn from, the same on all ranks.
-            config: settings, the same on all ranks.
-            device: of this rank.
-            ranks: all ranks.
-            beside: sum gradients after a CUDA graph instead of inside; None decides by `sums_beside`.
-            options: of `Trainer`, the same on all ranks.
-
-        Raises:
-            SceneError: there are fewer training views than ranks.
-            RankError: scene or settings differ between ranks.
+        `beside` sums gradients after a CUDA graph instead of inside; None decides by `sums_beside`. SceneError where
+        there are fewer training views than ranks, RankError where scene or settings differ between ranks.
         """
         views = len(scene.train)
         if views < ranks.size:
@@ -130,9 +119,8 @@ class ParallelTrainer(Trainer):
             needed = needed_memory(error)
             if sent is None or needed is None or capturing(self.device):
                 raise
-            message = f"out of memory while gradients were sent: needed {needed}"
-        # The other ranks have part of the step: it cannot be repeated here.
-        raise UpdateError(message, needed)
+            # The other ranks have part of the step: it cannot be repeated here.
+            raise UpdateError(f"out of memory while gradients were sent: needed {needed}", needed) from None
 
     def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
         return loss * self.share
@@ -149,7 +137,6 @@ class ParallelTrainer(Trainer):
         super()._update(self.reducer.finish(self._trained(), errors))
 
     def _unneeded(self) -> torch.Tensor:
-        """Return the surfels that are needed least; the ranks share the cameras out."""
         ranks, cameras = self.ranks, self.views.refined_cameras(self.poses)
         mine, share = cameras[ranks.rank :: ranks.size], self.config.densify.relocate
         return least_contributing(self.model(), mine, share, ranks.largest)
@@ -162,11 +149,7 @@ class ParallelTrainer(Trainer):
         return key._replace(kernels=(key.kernels, self.share))
 
     def check(self) -> None:
-        """Raise DivergedError, the same one on all ranks, unless all numbers are finite.
-
-        Raises:
-            RankError: parameters differ between ranks.
-        """
+        """Raise DivergedError, the same on all ranks, unless all numbers are finite; RankError where ranks differ."""
         fault: DivergedError | None = None
         try:
             super().check()
@@ -205,11 +188,7 @@ class ParallelTrainer(Trainer):
 def sums_beside(backend: str, surfels: Surfels, texture: NeuralTexture, config: Config) -> bool:
     """Whether gradients are better summed after a step's CUDA graph: the backend cannot be captured, or there are many.
 
-    Args:
-        backend: of the ranks, "nccl" or "gloo".
-        surfels: what is trained.
-        texture: likewise; only one that is used has gradients.
-        config: settings; the surfels are counted as many as they may become.
+    The surfels are counted as many as they may become.
     """
     a_surfel = sum(x.numel() // max(len(surfels), 1) for x in surfels.parameters())
     count = a_surfel * config.max_surfels + sum(x.numel() for x in texture.parameters() if config.max_hits)
@@ -222,10 +201,6 @@ def scale_for_batch(optimizer: torch.optim.Optimizer, views: int) -> None:
     The square-root rule for Adam (Malladi et al. 2022, On the SDEs and scaling rules for adaptive gradient algorithms):
     rates are multiplied by the square root of the number of views, and moments forget as much in a step as in that
     many steps of one view. Other optimizers keep their other settings.
-
-    Args:
-        optimizer: as `make_optimizer` makes it.
-        views: of a step.
     """
     for group in optimizer.param_groups:
         first, last = group["ends"]

@@ -4,8 +4,7 @@ Not in the paper. What a student learns from teachers is in `nexwarp.train.teach
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, Protocol
@@ -41,17 +40,11 @@ Observer = Callable[[StepReport], None]
 
 @dataclass(frozen=True)
 class OwnTeachers:
-    """The teachers that a run trains before its student.
-
-    Attributes:
-        count: how many.
-        iterations: of each.
-        max_surfels: of each; None is the student's.
-    """
+    """The teachers that a run trains before its student: how many, and the settings of each."""
 
     count: int
     iterations: int
-    max_surfels: int | None = None
+    max_surfels: int | None = None  # None is the student's
 
 
 NO_TEACHERS = OwnTeachers(0, 0)
@@ -59,19 +52,12 @@ NO_TEACHERS = OwnTeachers(0, 0)
 
 @dataclass(frozen=True)
 class Stage:
-    """One of the trainings of a run.
+    """One of the trainings of a run."""
 
-    Attributes:
-        config: its settings; none of them asks for teachers.
-        teachers: how many teachers the run trains.
-        number: of the teacher, from 1; 0 for the student, whose model is the run's.
-        before: iterations that earlier stages have.
-    """
-
-    config: Config
-    teachers: int = 0
-    number: int = 0
-    before: int = 0
+    config: Config  # its settings; none of them asks for teachers
+    teachers: int = 0  # how many the run trains
+    number: int = 0  # of the teacher, from 1; 0 for the student, whose model is the run's
+    before: int = 0  # iterations that earlier stages have
 
     @property
     def teacher(self) -> bool:
@@ -86,37 +72,21 @@ class Stage:
         return "student" if self.teachers else "training"
 
 
-def teacher_count(config: Config, photos: int) -> int:
-    """Return how many teachers a run trains first: `config.teachers`, or what its None stands for.
-
-    Args:
-        config: of the run.
-        photos: number of training photos.
-    """
-    if config.teachers is not None:
-        return config.teachers
-    few = photos <= MOST_PHOTOS and config.max_surfels >= SURFELS_A_PHOTO * photos
-    return TEACHERS if few and config.iterations >= REFERENCE_ITERATIONS and not config.refine_poses else 0
-
-
 def plan_teachers(config: Config, photos: int) -> OwnTeachers:
-    """Return the teachers that a run trains first, which have two fifths of its iterations together.
-
-    Args:
-        config: of the run.
-        photos: number of training photos.
-    """
-    count, most = teacher_count(config, photos), config.max_surfels
+    """Return the teachers that a run trains first, which have two fifths of its iterations together."""
+    most = config.max_surfels
+    count = config.teachers
+    if count is None:
+        few = photos <= MOST_PHOTOS and most >= SURFELS_A_PHOTO * photos
+        count = TEACHERS if few and config.iterations >= REFERENCE_ITERATIONS and not config.refine_poses else 0
+    if not count:
+        return NO_TEACHERS
     surfels = max(most, min(TEACHER_TIMES * most, TEACHER_SURFELS))
-    return OwnTeachers(count, max(int(SHARE * config.iterations / count), 1), surfels) if count else NO_TEACHERS
+    return OwnTeachers(count, max(int(SHARE * config.iterations / count), 1), surfels)
 
 
 def divide(config: Config, own: OwnTeachers) -> list[Stage]:
-    """Return the stages of a run: its teachers, and the student, which has the rest of the iterations.
-
-    Raises:
-        SettingError: nothing is left for the student.
-    """
+    """Return the stages of a run; SettingError where the teachers leave no iterations for the student."""
     taken, count, surfels = own.count * own.iterations, own.count, own.max_surfels or config.max_surfels
     if config.iterations <= taken:
         raise SettingError(f"iterations: expected more than the teachers' {taken}, got {config.iterations}")
@@ -146,13 +116,7 @@ class StageStore(Protocol):
 
 
 class StageRunner:
-    """Runs the trainings of a run in their order.
-
-    Attributes:
-        stages: all of them.
-        stage: the one that runs, or comes next.
-        trainer: of this stage.
-    """
+    """Runs the trainings of a run in their order: `stage`, with `trainer`, is the one that runs, or comes next."""
 
     def __init__(
         self,
@@ -163,13 +127,10 @@ class StageRunner:
     ) -> None:
         """Make the trainer of the first stage that is not complete; no step is done yet.
 
-        Args:
-            stages: see `divide`.
-            make: makes a trainer of settings and of models to learn from.
-            store: what is kept.
-            teachers: models that the student learns from where the run trains none of its own.
+        `make` makes a trainer of settings and models to learn from; the student learns from `teachers` where the run
+        trains none of its own.
         """
-        self.stages, self.make, self.store, self.given = stages, make, store, teachers
+        self.stages, self.make, self.store, self.teachers = stages, make, store, teachers
         self.models: list[Model] = []
         for stage in stages[:-1]:
             model = store.complete(stage)
@@ -180,18 +141,17 @@ class StageRunner:
 
     def _begin(self) -> None:
         self.stage = self.stages[len(self.models)]
-        self.trainer = self.make(self.stage.config, () if self.stage.teacher else self.models or self.given)
+        self.trainer = self.make(self.stage.config, () if self.stage.teacher else self.models or self.teachers)
         self.store.begin(self.stage, self.trainer)
 
     def train_teachers(self) -> None:
-        """Train and finish the teachers; the student's trainer is then before its first step.
-
-        Raises:
-            OutOfMemoryError: it names the teacher, and says how to train without.
-        """
+        """Train and finish the teachers; the student's trainer is then before its first step."""
         while self.stage.teacher:
-            with _naming(self.stage):
+            try:
                 self.store.train(self.stage, self.trainer)
+            except OutOfMemoryError as error:
+                message = f"{self.stage.name}: {error}, or do without teachers (--set teachers=0)"
+                raise OutOfMemoryError(message, error.needed) from error
             self.models.append(self.store.finish(self.stage, self.trainer))
             del self.trainer  # before the next one takes memory
             self._begin()
@@ -204,16 +164,6 @@ class StageRunner:
     def finish(self) -> Model:
         """Return the finished model of the student."""
         return self.store.finish(self.stage, self.trainer)
-
-
-@contextmanager
-def _naming(stage: Stage) -> Iterator[None]:
-    """Name the teacher in an OutOfMemoryError of its training, and say how to do without."""
-    try:
-        yield
-    except OutOfMemoryError as error:
-        message = f"{stage.name}: {error}, or do without teachers (--set teachers=0)"
-        raise OutOfMemoryError(message, error.needed) from error
 
 
 class InMemory:
@@ -260,15 +210,8 @@ def stage_runner(
 ) -> StageRunner:
     """Return the runner of a training.
 
-    Args:
-        scene: what to learn from.
-        config: settings of the run.
-        device: where to train.
-        store: what is kept of the stages.
-        own: teachers that the run trains; None plans them, or none where `teachers` are given.
-        ranks: the processes that train together; None is this one alone.
-        teachers: models that the student learns from instead of the run's own.
-        extensions: `losses` and `optimizer`, see `nexwarp.train`.
+    `own` are the teachers that the run trains: None plans them, or none where `teachers`, models, are given instead.
+    `extensions` are `losses` and `optimizer` of `nexwarp.train`.
     """
     models: Any = teachers if isinstance(teachers, Model) else list(teachers)  # `Trainer` says what is wrong with it
     if own is None:
@@ -279,7 +222,7 @@ def stage_runner(
         return calibrate_exposures(scene, config)
 
     def make(settings: Config, learned_from: Sequence[Model]) -> Trainer:
-        options = extensions | {"teachers": learned_from, "calibrate": lambda *_: calibration()}
+        options = {**extensions, "teachers": learned_from, "calibrate": lambda *_: calibration()}
         if ranks is None or ranks.size == 1:
             return Trainer(scene, settings, device, **options)
         return ParallelTrainer(scene, settings, device, ranks, **options)

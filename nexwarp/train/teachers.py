@@ -46,11 +46,7 @@ class TaughtTargets(TargetSource):
     ) -> None:
         """Move the models to the device; on a GPU their frames share memory from then on.
 
-        Args:
-            state: of the training.
-            calibration: exposures of the photos; None where they have one exposure.
-            models: trained ones of the scene, at least one.
-            repeatable: renders, again with more memory where it does not suffice.
+        `repeatable` renders, again with more memory where it does not suffice.
         """
         super().__init__(state, calibration)
         self.teachers, self.repeatable = [model.to(state.device) for model in models], repeatable
@@ -88,12 +84,7 @@ class TaughtTargets(TargetSource):
         return self.repeatable(partial(self.taught, target, number)) if self.teaches(number) else target
 
     def taught(self, of_photo: Target, number: int) -> Target:
-        """Return the target of a step with a teacher: the teacher's rendering at the photos' mean exposure.
-
-        Args:
-            of_photo: target with the photo of the step's training view, whose size the rendering has.
-            number: of the step.
-        """
+        """Return the target of a step with a teacher: its rendering, of the photo's size, at the mean exposure."""
         _, near, teacher = self.choice(number)
         c = of_photo.camera
         camera = Camera(near.viewmat.to(c.K.device), c.K, c.width, c.height, c.near)
@@ -117,13 +108,7 @@ class TaughtTargets(TargetSource):
 
 
 def check_teachers(teachers: Iterable[Model], scene: Scene, config: Config) -> list[Model]:
-    """Return the models that a training learns from as a list.
-
-    Raises:
-        TypeError: one is not a model.
-        ValueError: the settings name a number of teachers, which one training does not train; one is of a scene of
-            another scale; or the training learns poses, which teachers do not follow.
-    """
+    """Return the models that a training learns from as a list; TypeError or ValueError where they do not fit it."""
     if config.teachers:
         raise ValueError(
             f"config.teachers: expected 0 or None, as a Trainer trains one model, got {config.teachers}; "

@@ -10,7 +10,7 @@ from nexwarp.model import render as module
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.ops.rays import RayTiles
-from nexwarp.run.metrics import psnr
+from nexwarp.run.evaluate import psnr
 from tests import scenes
 from tests.panorama_support import places, turned
 from tests.tolerances import FLIPS, assert_close, assert_same_ids

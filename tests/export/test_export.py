@@ -11,7 +11,7 @@ from nexwarp.cameras.paths import look_at
 from nexwarp.export.splats import Pieces, split_large
 from nexwarp.export.surfels_ply import THINNESS, load_surfels_ply, save_splats_ply, save_surfels_ply
 from nexwarp.io.pictures import to_uint8
-from nexwarp.run.metrics import psnr
+from nexwarp.run.evaluate import psnr
 from tests.reference import ewa
 from tests.reference.collect import rotations
 from tests.scenes import intrinsics, make_surfels, random_scene

@@ -18,7 +18,7 @@ from nexwarp.model.compact import CODE, DTYPES, LARGEST, REACH, decode, encode
 from nexwarp.model.detail_limits import NEVER, DetailLimits
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import COMPACT_VERSION, MODEL_FILE, save_model
-from nexwarp.run.metrics import psnr
+from nexwarp.run.evaluate import psnr
 from tests.docs.test_docs import DOCS
 from tests.model_file_support import make_model, refused, rewrite
 from tests.scenes import make_camera, random_scene

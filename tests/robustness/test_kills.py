@@ -14,7 +14,7 @@ import pytest
 from nexwarp.cli import main as cli
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE
-from nexwarp.run.contents import CONFIG_FILE
+from nexwarp.run.folder import CONFIG_FILE
 from nexwarp.train import recipe
 from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.finish.finish import FinishObserver

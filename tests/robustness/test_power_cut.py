@@ -23,8 +23,17 @@ from nexwarp.io import files
 from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
 from nexwarp.run import folder
-from nexwarp.run.contents import CONFIG_FILE, LOG_FILE, METRICS_FILE, remove_leftovers
-from nexwarp.run.folder import RunRecord, claimed_run, create_run, read_metrics, read_run
+from nexwarp.run.folder import (
+    CONFIG_FILE,
+    LOG_FILE,
+    METRICS_FILE,
+    RunRecord,
+    claimed_run,
+    create_run,
+    read_metrics,
+    read_run,
+    remove_leftovers,
+)
 from nexwarp.run.log import _open_log, keep_lines
 from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint

@@ -37,9 +37,8 @@ from nexwarp.errors import NexwarpError, RunError
 from nexwarp.io.files import is_temporary
 from nexwarp.kernels import launch
 from nexwarp.model.model_file import load
-from nexwarp.run.contents import LOCK_FILE
 from nexwarp.run.export import ExportOrder, export_run
-from nexwarp.run.folder import read_run
+from nexwarp.run.folder import LOCK_FILE, read_run
 from nexwarp.run.opened import open_model
 from nexwarp.train import recipe
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
@@ -62,7 +61,7 @@ ROOT = Path(__file__).parents[2]
 CHECKPOINT_FILES = [f"checkpoint{age}/{file}" for age in ("", ".old") for file in ("state.json", "tensors.safetensors")]
 DAMAGED = ["config.json", "model.safetensors", "metrics.jsonl", "cameras.json", *CHECKPOINT_FILES]
 NOTES = ["checkpoint/notes.txt", "checkpoint.old/notes.txt"]
-FOREIGN = ["notes.txt", "renders/mine.png", "renders/test/b.png", "export/a.obj", "mine/config.json", *NOTES]
+FOREIGN = ["notes.txt", "renders/mine.png", "export/a.obj", "mine/config.json", *NOTES]
 
 names = st.sampled_from("aaab")
 seeds = st.sampled_from([0, 1])

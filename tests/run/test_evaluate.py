@@ -13,8 +13,7 @@ from PIL import Image
 import nexwarp as nw
 from nexwarp.data import View
 from nexwarp.io.pictures import CAPTION_HEIGHT, error_map, to_uint8
-from nexwarp.run.evaluate import evaluate
-from nexwarp.run.metrics import CONVENTION, ssim
+from nexwarp.run.evaluate import CONVENTION, evaluate, ssim
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 
 WIDTH, HEIGHT, GAP = 40, 30, 4

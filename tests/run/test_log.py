@@ -15,7 +15,7 @@ import torch
 
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene, load_scene
-from nexwarp.run.contents import LOG_FILE, TENSORBOARD_FOLDER
+from nexwarp.run.folder import LOG_FILE, TENSORBOARD_FOLDER
 from nexwarp.run.log import TrainingLog, keep_lines, peak_memory
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.report import StepReport

@@ -13,7 +13,7 @@ import torch
 
 from nexwarp.io.pictures import to_uint8
 from nexwarp.ops import ssim as ops_ssim
-from nexwarp.run import metrics
+from nexwarp.run import evaluate as metrics
 from nexwarp.train import losses
 
 

@@ -11,7 +11,7 @@ import safetensors.torch
 import torch
 
 from nexwarp.io.files import write_atomically
-from nexwarp.run.contents import remove_leftovers
+from nexwarp.run.folder import remove_leftovers
 from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, has_checkpoint, load_checkpoint, save_checkpoint
 from tests.faults import Killed, kill_at

@@ -17,8 +17,7 @@ from nexwarp.cli import main as cli
 from nexwarp.cli.session import Session
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import OutOfMemoryError, SettingError
-from nexwarp.run.contents import list_files
-from nexwarp.run.folder import RunRecord, create_run, read_run
+from nexwarp.run.folder import RunRecord, create_run, list_files, read_run
 from nexwarp.train import stages as train_stages
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
@@ -26,7 +25,7 @@ from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import PRESETS, TextureConfig, preset
 from nexwarp.train.report import StepReport
 from nexwarp.train.settings import config_from_dict
-from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, stage_runner, teacher_count
+from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, stage_runner
 from tests.exposed import expose_photos
 from tests.scene_writers import write_demo
 
@@ -69,7 +68,7 @@ def settings_of(config: Config, own: OwnTeachers) -> list[Config]:
 )
 def test_a_run_has_teachers_where_photos_are_few(changes: dict[str, Any], photos: int, count: int) -> None:
     config = dataclasses.replace(Config(), **changes)
-    assert teacher_count(config, photos) == plan_teachers(config, photos).count == count
+    assert plan_teachers(config, photos).count == count
 
 
 def test_only_the_papers_preset_does_without() -> None:

@@ -7,120 +7,96 @@ is JSON or raw bytes; nothing is unpickled.
 
 import json
 import os
-import socket
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
+from datetime import timedelta
 from types import TracebackType
 
 import torch
 import torch.distributed as dist
+from torch import nn
+from torch.distributed.distributed_c10d import PrefixStore
+from torch.distributed.rendezvous import rendezvous
 
-from nexwarp.errors import RankError
-from nexwarp.train.ranks.join import FOREVER, Place, first_difference, join_store
-from nexwarp.train.ranks.liveness import Liveness
+from nexwarp.errors import NexwarpError, RankError
+from nexwarp.io.files import one_line
+
+JOIN_SECONDS = 300.0
+WAIT_VARIABLE = "NEXWARP_JOIN_SECONDS"
+# A viewer may pause a training: it is the death of a rank that ends the others, not a long wait.
+FOREVER = timedelta(days=365)
+# What gloo and NCCL say when the process at the other end is gone.
+LOST = re.compile(r"gloo|nccl|connection (closed|reset|refused)|broken pipe|socket", re.I)
+ALIGNMENT = 4  # numbers; vector loads need addresses that are multiples of 16 bytes
+
+
+class LostRankError(RankError):
+    """Another rank has ended, which this one has learnt from a message that did not arrive."""
 
 
 class Ranks:
-    """The ranks of a training, seen from one of them; a context, in which the death of one rank ends all.
+    """The ranks of a training, seen from one of them, as a context.
 
     Attributes:
         rank: number of this one, from 0; rank 0 writes files and shows progress.
         size: how many there are.
-        local_rank: number of this one among those on this machine, which have consecutive ranks.
-        local_size: how many of them are on this machine.
         device: of this rank.
         backend: of the gradients, "nccl" or "gloo"; "" for a process alone.
-        launch: identifies the launch; the same after torchrun has restarted the ranks. "" for a process alone.
-        restarted: whether torchrun has restarted the ranks.
     """
 
-    def __init__(self, place: Place, device: torch.device, backend: str) -> None:
+    def __init__(self, rank: int, size: int, device: torch.device, backend: str) -> None:
         """Use `join`, or `alone`, instead."""
-        self.rank, self.size = place.rank, place.size
-        self.local_rank, self.local_size = place.local_rank, place.local_size
+        self.rank, self.size = rank, size
         self.device, self.backend = device, backend
-        self.launch, self.restarted = place.launch, place.restarted
         self.control: dist.ProcessGroup | None = None
-        self.liveness: Liveness | None = None
         self.vote: tuple[dist.Work, torch.Tensor] | None = None
 
     @classmethod
     def alone(cls, device: torch.device) -> "Ranks":
         """Return the only rank of a training in one process: nothing is sent."""
-        return cls(Place(0, 1, 0, 1, "", False), device, "")
+        return cls(0, 1, device, "")
 
     @classmethod
-    def join(
-        cls,
-        device: torch.device,
-        facts: dict[str, str],
-        *,
-        fault: str | None = None,
-        backend: str | None = None,
-        hint: str = "",
-    ) -> "Ranks":
-        """Join the other ranks that the environment variables of torchrun tell of.
+    def join(cls, device: torch.device, *, backend: str | None = None) -> "Ranks":
+        """Join the other ranks that torchrun's environment variables tell of; RankError unless all come in time.
 
-        Args:
-            device: of this rank.
-            facts: what must be the same on all ranks, such as the version of the code, by name.
-            fault: why this rank cannot take part; None if it can.
-            backend: of the gradients; None is NCCL for GPUs, else gloo.
-            hint: added to the message when a rank has died.
-
-        Raises:
-            RankError: not all ranks came, one cannot take part, or their facts differ; all ranks raise the same, unless
-                the end of another, which has told why, ends a rank first.
+        `backend` is that of the gradients; None is NCCL for GPUs, else gloo.
         """
-        place = Place.of_environment()
-        store = join_store(place)
         backend = backend or ("nccl" if device.type == "cuda" else "gloo")
-        ranks = cls(place, device, backend)
-        dist.init_process_group(backend, store=store, rank=place.rank, world_size=place.size, timeout=FOREVER)
-        ranks.control = dist.new_group(backend="gloo", timeout=FOREVER)
-        watched = dist.new_group(backend="gloo", timeout=FOREVER)
-        names = [str(name) for name in ranks.gather(f"process {os.getpid()} on {socket.gethostname()}")]
-        ranks.liveness = Liveness(place, watched, names, hint)
+        seconds = float(os.environ.get(WAIT_VARIABLE, JOIN_SECONDS))
         try:
-            if (told := next((x for x in ranks.gather(fault) if x is not None), None)) is not None:
-                raise RankError(str(told))
-            ranks.check_same(facts)
-        except BaseException as error:  # the caller has no context yet that would tell the others
-            ranks.liveness.fail(error)
-            raise
+            store, rank, size = next(rendezvous("env://", timeout=timedelta(seconds=seconds)))
+            store = PrefixStore("nexwarp", store)
+            dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=FOREVER)
+        except (RuntimeError, ValueError, OSError) as error:
+            place = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
+            expected = f"expected {os.environ['WORLD_SIZE']} ranks to join at {place} within {seconds:.0f} s"
+            raise RankError(f"{expected} ({one_line(error)})") from None
+        ranks = cls(rank, size, device, backend)
+        ranks.control = dist.new_group(backend="gloo", timeout=FOREVER)
         return ranks
 
     def __enter__(self) -> "Ranks":
         return self
 
-    def __exit__(
-        self, _kind: type[BaseException] | None, error: BaseException | None, _trace: TracebackType | None
-    ) -> None:
-        if self.liveness is None:
-            return
-        if error is not None:
-            self.liveness.fail(error)
-        else:
+    def __exit__(self, _: type[BaseException] | None, error: BaseException | None, __: TracebackType | None) -> None:
+        if error is None:
             self.close()
+        elif isinstance(error, RuntimeError) and not isinstance(error, NexwarpError) and LOST.search(str(error)):
+            hint = "--resume continues from the last checkpoint"
+            raise LostRankError(f"rank {self.rank}: the connection to another rank is lost; {hint}") from error
 
     def close(self) -> None:
         """Part from the other ranks, once all are here; after it, each may end when it likes."""
-        if self.liveness is None:
-            return
-        self.barrier()
-        self.liveness.close()
-        self.liveness = self.control = None
-        dist.destroy_process_group()
+        if self.control is not None:
+            self.barrier()
+            self.control = None
+            dist.destroy_process_group()
 
     @property
     def first(self) -> bool:
         """Whether this is rank 0."""
         return self.rank == 0
-
-    def leave_together(self) -> None:
-        """Wait until all ranks are here; from now on, no rank's end is an error."""
-        if self.liveness is not None:
-            self.liveness.leaving = True
-            self.barrier()
 
     def barrier(self) -> None:
         """Wait until all ranks are here."""
@@ -151,11 +127,10 @@ class Ranks:
         sizes = [torch.zeros(1, dtype=torch.int64) for _ in range(self.size)]
         dist.all_gather(sizes, torch.tensor([len(content)], dtype=torch.int64), group=self.control)
         longest = max(int(size) for size in sizes)
-        mine = torch.zeros(longest, dtype=torch.uint8)
-        mine[: len(content)] = torch.frombuffer(bytearray(content or b"\0"), dtype=torch.uint8)[: len(content)]
-        found = [torch.zeros(longest, dtype=torch.uint8) for _ in range(self.size)]
-        dist.all_gather(found, mine, group=self.control)
-        return [x[: int(size)].numpy().tobytes() for x, size in zip(found, sizes, strict=True)]
+        mine = torch.frombuffer(bytearray(content.ljust(max(longest, 1), b"\0")), dtype=torch.uint8)
+        padded = [torch.zeros_like(mine) for _ in range(self.size)]
+        dist.all_gather(padded, mine, group=self.control)
+        return [x[: int(size)].numpy().tobytes() for x, size in zip(padded, sizes, strict=True)]
 
     def gather(self, value: object) -> list[object]:
         """Return the JSON value of each rank, on all ranks."""
@@ -163,9 +138,13 @@ class Ranks:
 
     def check_same(self, facts: dict[str, str]) -> None:
         """Raise RankError, the same one on all ranks, unless each fact is the same on all of them."""
-        told = first_difference(self.gather(facts))
-        if told is not None:
-            raise RankError(told)
+        for rank, theirs in enumerate(self.gather(list(facts.values()))):
+            assert isinstance(theirs, list)
+            if rank == 0:
+                reference = theirs
+            for name, expected, value in zip(facts, reference, theirs, strict=True):
+                if value != expected:
+                    raise RankError(f"rank {rank}: expected the same {name} as rank 0, {expected}, got {value}")
 
     def share_tensors(self, tensors: Iterable[torch.Tensor]) -> None:
         """Overwrite tensors, which are on the ranks' devices, with those of rank 0."""
@@ -182,26 +161,89 @@ class Ranks:
         return values
 
     def agree(self, number: int | None, *, now: bool = False) -> int | None:
-        """Return the largest number that ranks gave in their previous call; the same on all ranks.
+        """Return the largest number > 0 that ranks gave in their previous call, or in this one with `now`.
 
-        The answer comes one call late, so that no step waits for it.
-
-        Args:
-            number: of this rank, > 0; None is none.
-            now: answer by this call's numbers, which waits for the other ranks.
+        The answer, the same on all ranks, comes one call late, so that no step waits for it.
         """
         if self.size == 1:
             return number
-        before, given = self._voted(), torch.tensor([number or 0])
-        work = dist.all_reduce(given, dist.ReduceOp.MAX, group=self.control, async_op=True)
+        before = self._voted()
+        mine = torch.tensor([number or 0])
+        work = dist.all_reduce(mine, dist.ReduceOp.MAX, group=self.control, async_op=True)
         assert work is not None
-        self.vote = work, given
+        self.vote = work, mine
         return max(before, self._voted() if now else 0) or None
 
     def _voted(self) -> int:
         if self.vote is None:
             return 0
-        work, given = self.vote
+        work, largest = self.vote
         work.wait()
         self.vote = None
-        return int(given)
+        return int(largest)
+
+
+class GradientReducer:
+    """Sums the gradients of one step over the ranks: one all-reduce in two buckets.
+
+    The hash grid's gradient, the largest, is complete before the backward pass goes through the surfels: its bucket is
+    the tensor itself, and travels meanwhile. All others and the surfels' error sums follow as a second bucket. Both are
+    sent in this order on every rank, whatever a rank renders, and all ranks receive the same bits.
+
+    Attributes:
+        overlapped: whether the first bucket is sent as soon as it is complete, or after the backward pass.
+        sent: the first bucket of a step, from its sending until both have arrived.
+        bytes_sent: bytes of the last step's buckets.
+    """
+
+    def __init__(self, early: nn.Parameter | None) -> None:
+        """Watch for the gradient of `early`, which is complete first; None sends all at the end."""
+        self.early = early
+        self.overlapped = True
+        self.sent: dist.Work | None = None
+        self.bytes_sent = 0
+        if early is not None:
+            early.register_post_accumulate_grad_hook(self._send_early)
+
+    def _send_early(self, parameter: torch.Tensor) -> None:
+        if self.overlapped:
+            self._send(parameter)
+
+    def _send(self, parameter: torch.Tensor) -> None:
+        assert parameter.grad is not None
+        self.bytes_sent = parameter.grad.nbytes
+        self.sent = dist.all_reduce(parameter.grad, async_op=True)
+
+    def finish(self, parameters: Sequence[nn.Parameter], sums: torch.Tensor | None) -> torch.Tensor | None:
+        """Replace the gradients of parameters by their sums over the ranks, after the backward pass.
+
+        Parameters have the same order on all ranks; one without a gradient counts as zero. `sums`, (N,), are further
+        numbers to sum, or None on all ranks; their sums are returned.
+        """
+        for parameter in parameters:
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+        if self.early is not None and self.sent is None:
+            self._send(self.early)
+        early = self.sent
+        rest = [x for x in parameters if x is not self.early]
+        parts = [x.grad for x in rest if x.grad is not None] + ([] if sums is None else [sums])
+        flat, places = _flattened(parts)
+        self.bytes_sent = (0 if early is None else self.bytes_sent) + flat.nbytes
+        last = dist.all_reduce(flat, async_op=True)
+        for work in (early, last):
+            if work is not None:
+                work.wait()
+        self.sent = None
+        for parameter, place in zip(rest, places, strict=False):
+            parameter.grad = place
+        return None if sums is None else places[-1]
+
+
+def _flattened(parts: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Return one vector that holds copies of all tensors, and these copies."""
+    lengths = [-(-x.numel() // ALIGNMENT) * ALIGNMENT for x in parts]
+    flat = parts[0].new_zeros(sum(lengths))
+    places = [x[: part.numel()].view(part.shape) for x, part in zip(flat.split(lengths), parts, strict=True)]
+    torch._foreach_copy_(places, list(parts))
+    return flat, places
