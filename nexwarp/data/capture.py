@@ -95,12 +95,7 @@ def scene_errors() -> Iterator[None]:
 
 
 def safe_name(where: str, name: str, folder: str) -> str:
-    """Normalise a relative path of a scene: "/" as separator, without ".".
-
-    Args:
-        where: place of the name, for messages.
-        name: the path.
-        folder: what the path is relative to, for messages.
+    """Normalise a path relative to the `folder` of a message: "/" as separator, without ".".
 
     Raises:
         ValueError: the path is not printable, is absolute or has ".." on any operating system, or is too long.
@@ -121,16 +116,10 @@ def safe_name(where: str, name: str, folder: str) -> str:
 
 
 def inside_folder(where: str, path: Path, folder: Path, follow_links: bool) -> Path:
-    """Return `path` after a check that symbolic links do not lead out of `folder`; `folder` itself may be a link.
-
-    Args:
-        where: place of the path, for messages.
-        path: a path below `folder`.
-        folder: a folder of the scene.
-        follow_links: allow links that lead out of the folder.
+    """Return a path below `folder`, which may be a link itself.
 
     Raises:
-        ValueError: a link leads out of the folder.
+        ValueError: a symbolic link leads out of the folder, and `follow_links` does not allow it.
     """
     if follow_links:
         return path
@@ -139,40 +128,33 @@ def inside_folder(where: str, path: Path, folder: Path, follow_links: bool) -> P
     except (OSError, RuntimeError):  # circular links
         inside = False
     if not inside:
-        found = f"{where} {short(path.name)}: a link leaves {folder}, expected a file in it"
-        raise ValueError(f"{found}; --follow-links allows it, for scenes that you trust")
+        link = f"{where} {short(path.name)}: a link leaves {folder}, expected a file in it"
+        raise ValueError(f"{link}; --follow-links allows it, for scenes that you trust")
     return path
 
 
 def report_missing(source: Path, names: Sequence[str], count: int, skip: bool) -> None:
-    """Name the photos that do not exist.
+    """Raise FileNotFoundError naming the photos of `count` that do not exist.
 
-    Args:
-        source: the file or folder that names them.
-        names: of the missing photos.
-        count: number of all photos.
-        skip: warn instead of raising, as long as two photos are left.
-
-    Raises:
-        FileNotFoundError: photos are missing.
+    With `skip`, warn instead, as long as two photos are left.
     """
     if not names:
         return
     listed = ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" * (len(names) > MOST_NAMED))
-    found = f"{source}: {len(names)} of {count} photos: image not found: {listed}"
+    absent = f"{source}: {len(names)} of {count} photos: image not found: {listed}"
     if not skip or count - len(names) < 2:
-        raise FileNotFoundError(f"{found}; --skip-missing goes on without them" if not skip else found)
-    warnings.warn(f"{found}; going on without them", stacklevel=2)
+        raise FileNotFoundError(absent if skip else f"{absent}; --skip-missing goes on without them")
+    warnings.warn(f"{absent}; going on without them", stacklevel=2)
 
 
 def distinct_photos(source: Path, photos: Iterable[Photo]) -> list[Photo]:
     """Return photos as a list; raise ValueError at the first one whose name came before."""
-    found: dict[str, Photo] = {}
+    by_name: dict[str, Photo] = {}
     for photo in photos:
-        if photo.name in found:
+        if photo.name in by_name:
             raise ValueError(f"{source}: expected each photo once, got {photo.name} twice")
-        found[photo.name] = photo
-    return list(found.values())
+        by_name[photo.name] = photo
+    return list(by_name.values())
 
 
 def check_points(source: Path, positions: np.ndarray, what: str, name: Callable[[int], str]) -> None:

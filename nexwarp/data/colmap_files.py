@@ -167,14 +167,14 @@ def _opened(path: Path) -> Iterator[_Reader]:
 
 def _unique(path: Path, records: Iterator[tuple[int, Record]], limit: int = MAX_CAMERAS) -> dict[int, Record]:
     """Collect records by id; ValueError if an id occurs twice or there are more than `limit`."""
-    found: dict[int, Record] = {}
+    by_id: dict[int, Record] = {}
     for identity, record in records:
-        if identity in found:
+        if identity in by_id:
             raise ValueError(f"{path}: damaged, expected each id once, got {identity} twice")
-        found[identity] = record
-        if len(found) > limit:
+        by_id[identity] = record
+        if len(by_id) > limit:
             raise ValueError(f"{path}: expected at most {limit:,} records, got more")
-    return found
+    return by_id
 
 
 def _binary_camera(file: _Reader) -> tuple[int, CameraRecord]:

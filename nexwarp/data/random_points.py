@@ -38,16 +38,16 @@ def random_points(views: Sequence[View], scale: float, count: int = COUNT, seed:
     judges = [views[index] for index in np.unique(np.linspace(0, len(views) - 1, HULL_VIEWS).round().astype(int))]
     kept: list[tuple[np.ndarray, np.ndarray]] = []
     first: list[tuple[np.ndarray, np.ndarray]] = []
-    found = 0
+    total = 0
     for _ in range(ROUNDS):
         points, colors = _draw(views, viewmats, centres, depths, rng, count)
         keep = _plausible(judges, points, 2 if len(views) > 1 else 1)
         kept.append((points[keep], colors[keep]))
         first = first or [(points, colors)]
-        found += int(keep.sum())
-        if found >= count:
+        total += int(keep.sum())
+        if total >= count:
             break
-    if not found:  # all photos are transparent, or no two views see a common point
+    if not total:  # all photos are transparent, or no two views see a common point
         kept = first
     positions, colors = (np.concatenate(parts)[:count] for parts in zip(*kept, strict=True))
     return Cloud.of(positions, colors)

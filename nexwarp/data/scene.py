@@ -279,21 +279,21 @@ def find_format(path: Path, format: str | None = None) -> str:
         if format not in READERS:
             raise ValueError(f"format: expected one of {', '.join(READERS)}, got {format!r}")
         return format
-    found = ["colmap"] if has_model(path) else []
-    found += ["nerfstudio"] if (path / NERFSTUDIO_FILE).is_file() else []
-    found += ["blender"] if (path / BLENDER_FILES["train"]).is_file() else []
-    if len(found) > 1:
+    kinds = ["colmap"] if has_model(path) else []
+    kinds += ["nerfstudio"] if (path / NERFSTUDIO_FILE).is_file() else []
+    kinds += ["blender"] if (path / BLENDER_FILES["train"]).is_file() else []
+    if len(kinds) > 1:
         raise ValueError(
-            f"{path}: expected one kind of scene, got {' and '.join(READERS[kind] for kind in found)}; "
-            f"choose with format: {' or '.join(found)}"
+            f"{path}: expected one kind of scene, got {' and '.join(READERS[kind] for kind in kinds)}; "
+            f"choose with format: {' or '.join(kinds)}"
         )
-    if not found:
+    if not kinds:
         raise FileNotFoundError(
             f"{path}: no scene found, expected a COLMAP model (cameras, images and points3D, .bin or .txt, in "
             f"sparse/0, in sparse or in the folder itself), {NERFSTUDIO_FILE} of nerfstudio, or "
             f"{BLENDER_FILES['train']} of Blender"
         )
-    return found[0]
+    return kinds[0]
 
 
 def _read_views(
@@ -357,8 +357,8 @@ def _read_capture(source: SceneSource, path: Path, kind: str) -> Capture:
 
 def _check_folder(argument: str, path: Path, name: str) -> None:
     if not (path / name).is_dir():
-        found = sorted(entry.name for entry in path.glob(f"{argument}*") if entry.is_dir())
-        there = ", ".join(found) if found else f"no folder {argument}*"
+        folders = sorted(entry.name for entry in path.glob(f"{argument}*") if entry.is_dir())
+        there = ", ".join(folders) or f"no folder {argument}*"
         raise FileNotFoundError(f"{argument}: no folder {name!r} in {path}, which has {there}")
 
 

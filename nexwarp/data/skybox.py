@@ -95,11 +95,11 @@ def _empty(views: Sequence[View], points: torch.Tensor, cloud: torch.Tensor) -> 
     for view in views:
         camera = view.camera
         shown, pixels = _shown(view, points)
-        found, depths = camera.project(cloud.float())
-        found = found[in_image(found, depths, camera.width, camera.height)]
+        cloud_pixels, depths = camera.project(cloud.float())
+        cloud_pixels = cloud_pixels[in_image(cloud_pixels, depths, camera.width, camera.height)]
         gap = GAP * math.hypot(camera.width, camera.height)
         near = torch.zeros(len(shown), dtype=torch.bool)
-        for part in found.split(PART):
+        for part in cloud_pixels.split(PART):
             near |= (torch.cdist(pixels, part) < gap).any(dim=1)
         empty[shown] += ~near
     return empty

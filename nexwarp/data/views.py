@@ -83,10 +83,7 @@ class ViewReader:
         self.maps = Maps()
 
     def plan(self, photo: Photo) -> list[PlannedView]:
-        """Read the header of a photo and check it against its lens.
-
-        Returns:
-            One view, or six for a panorama.
+        """Read the header of a photo and check it against its lens; return one view, or six for a panorama.
 
         Raises:
             FileNotFoundError: the photo does not exist.
@@ -122,11 +119,7 @@ class ViewReader:
         return [PlannedView(_face(photo, face), size, target) for face in FACES]
 
     def read(self, plan: PlannedView, near: float) -> View:
-        """Read, undistort and reduce a photo.
-
-        Args:
-            plan: a view of `plan`.
-            near: near depth of its camera, world units.
+        """Read, undistort and reduce a photo; `near` is the near depth of its camera, world units.
 
         Raises:
             ValueError: the photo or mask cannot be decoded, the mask is empty, or the camera is invalid.
@@ -140,13 +133,8 @@ class ViewReader:
         K = plan.target.K.copy()
         K[:2] /= self.downscale
         try:
-            camera = Camera(
-                torch.from_numpy(photo.viewmat).float(),
-                torch.from_numpy(K).float(),
-                image.shape[1],
-                image.shape[0],
-                near,
-            )
+            viewmat = torch.from_numpy(photo.viewmat).float()
+            camera = Camera(viewmat, torch.from_numpy(K).float(), image.shape[1], image.shape[0], near)
         except ValueError as error:
             raise ValueError(f"{photo.file}: the camera of this image is not usable: {error}") from error
         points = None if photo.points is None else torch.from_numpy(photo.points)
@@ -188,20 +176,10 @@ def _face(photo: Photo, face: str) -> Photo:
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
-    """Find the mask of a photo in a folder: the photo's name with ".png" appended, or its stem with another suffix.
-
-    Args:
-        folder: folder of the masks.
-        name: path of the photo below the images folder.
-
-    Returns:
-        The file, or None if there is none.
-    """
+    """Find the mask of a photo in a folder: its name with ".png" appended, or its stem with another suffix, or None."""
     path = folder / name
-    for candidate in (path.with_name(f"{path.name}.png"), *(path.with_suffix(suffix) for suffix in MASK_SUFFIXES)):
-        if candidate.is_file():
-            return candidate
-    return None
+    candidates = [path.with_name(f"{path.name}.png"), *(path.with_suffix(suffix) for suffix in MASK_SUFFIXES)]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
 
 
 def _mask(photo: Photo, image: torch.Tensor, alpha: torch.Tensor | None) -> torch.Tensor | None:

@@ -34,7 +34,6 @@ def make_scene(
     names: list[str] | None = None,
     poses: list[np.ndarray] | None = None,
     points: np.ndarray | None = None,
-    size: tuple[int, int] = (WIDTH, HEIGHT),
     where: str = "sparse/0",
     text: bool = False,
 ) -> Path:
@@ -61,7 +60,7 @@ def make_scene(
     (reconstruction.write_text if text else reconstruction.write_binary)(str(folder))
     for name in names:
         if ".." not in name:
-            write_photo(path / "images" / name, size)
+            write_photo(path / "images" / name, (WIDTH, HEIGHT))
     return path
 
 
@@ -222,6 +221,12 @@ def lacking(name: str):
     return make
 
 
+def tall(path: Path) -> Path:
+    """A scene whose first photo is higher than wide."""
+    write_photo(make_scene(path) / "images" / "00.png", (36, 48))
+    return path
+
+
 def built(**options):
     """Maker of a scene with other options."""
     return lambda path: make_scene(path, **options)
@@ -250,7 +255,7 @@ BAD_SCENES = {
     "absent photo": (lacking("images/03.png"), "sparse/0: 1 of 10 photos: image not found: 03.png; --skip-missing"),
     "truncated photo": (damaged("images/03.png"), UNDECODABLE),
     "no photo at all": (damaged("images/03.png", lambda data: b"<html>not found</html>"), UNDECODABLE),
-    "photos of another shape": (built(size=(36, 48)), "00.png: expected an image of 48x36 .* got 36x48"),
+    "photos of another shape": (tall, "00.png: expected an image of 48x36 .* got 36x48"),
     "short cameras": (
         damaged("sparse/0/cameras.bin", lambda data: data[:-3]),
         "cameras.bin: truncated or damaged",

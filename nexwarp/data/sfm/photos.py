@@ -53,8 +53,8 @@ def list_photos(folder: Path) -> list[str]:
         kinds = Counter(f.suffix.lower() for f in files)
         others = [f"{kinds[s]} {s}: convert to JPEG or PNG first" for s in CONVERTIBLE if kinds[s]]
         others += [f"{kinds[s]} {s}: give the film itself to nexwarp process" for s in FILMS if kinds[s]]
-        found = "; ".join([f"{len(names) or 'none'}", *others])
-        raise ValueError(f"{folder}: expected at least {MIN_PHOTOS} photos ({', '.join(SUFFIXES)}), found {found}")
+        there = "; ".join([f"{len(names) or 'none'}", *others])
+        raise ValueError(f"{folder}: expected at least {MIN_PHOTOS} photos ({', '.join(SUFFIXES)}), found {there}")
     return names
 
 
