@@ -24,8 +24,7 @@ from nexwarp.model.texture import NeuralTexture
 class Model(nn.Module):
     """A trained scene: surfels, texture, exposures, detail limits, and the options of its rendering.
 
-    `save` and `nexwarp.load` keep everything. `state_dict` has the tensors only, without `options` and `meta`;
-    `load_state_dict` takes the state of a model with the same parts, and names what is missing or too much.
+    `save` and `nexwarp.load` keep everything; `state_dict` has the tensors only, without `options` and `meta`.
 
     Attributes:
         surfels: the N surfels, float32.
@@ -75,24 +74,6 @@ class Model(nn.Module):
         self.detail_limits = detail_limits
         self.options = RenderOptions() if options is None else options
         self.meta: dict[str, Json] = dict(meta or {})
-
-    def _load_from_state_dict(
-        self,
-        state_dict: dict[str, torch.Tensor],
-        prefix: str,
-        local_metadata: dict[str, object],
-        strict: bool,
-        missing_keys: list[str],
-        unexpected_keys: list[str],
-        error_msgs: list[str],
-    ) -> None:
-        """Name the tensors of parts that were set to None, too: torch passes over them when a state dict is loaded."""
-        for part, module in self._modules.items():
-            if strict and module is None:
-                unexpected_keys += [name for name in state_dict if name.startswith(f"{prefix}{part}.")]
-        super()._load_from_state_dict(
-            state_dict, prefix, local_metadata, strict, missing_keys, unexpected_keys, error_msgs
-        )
 
     @property
     def device(self) -> torch.device:

@@ -105,16 +105,6 @@ def test_crops_of_a_panorama_are_pinhole_views():
         assert psnr(sample[0].permute(1, 2, 0).clamp(0, 1), expected.clamp(0, 1)) > 40, (yaw, pitch)
 
 
-def test_a_fisheye_without_a_lens_is_the_rays_of_its_angles():
-    """With k = 0, a pixel's distance from the centre is the angle times f; beyond 180 degrees there is nothing."""
-    K = torch.tensor([[30.0, 0, 100], [0, 30, 100], [0, 0, 1]])
-    camera = nw.RayCamera.fisheye(torch.eye(4), K, (0, 0, 0, 0), 200, 200)
-    x = torch.arange(200) + 0.5 - 100
-    radius = torch.hypot(x[None], x[:, None]) / 30
-    assert_close(camera.rays[..., 2], torch.where(radius <= math.pi, radius.cos(), 0.0), kind="value", name="z")
-    assert ((camera.rays.norm(dim=-1) > 0) == (radius <= math.pi)).all()
-
-
 def test_a_fisheye_inverts_its_lens():
     K = torch.tensor([[30.0, 0, 32], [0, 31, 24], [0, 0, 1]], dtype=torch.float64)
     k = (0.05, -0.02, 0.003, -0.0001)
@@ -163,11 +153,3 @@ def test_an_orthographic_view_is_a_pinhole_far_away():
 def test_bad_cameras_are_named(make, match):
     with pytest.raises((TypeError, ValueError), match=match):
         make(torch.eye(4))
-
-
-def test_nothing_is_seen_of_no_surfels_and_through_no_rays():
-    none = nw.Surfels({name: x[:0] for name, x in scenes.make_surfels(scenes.random_scene(4)).state_dict().items()})
-    out = Model(none, None, options=RenderOptions(background=(0.5, 0.25, 0.0))).render(
-        nw.RayCamera.panorama(torch.eye(4), 16)
-    )
-    assert (out.alpha == 0).all() and (out.image == torch.tensor([0.5, 0.25, 0.0])).all()

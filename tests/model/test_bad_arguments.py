@@ -8,9 +8,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.kernels.types import MAX_SH_DEGREE
 from tests.scenes import (
-    CAMERA_KEYS,
     SURFEL_KEYS,
     make_camera,
     make_surfels,
@@ -47,22 +45,17 @@ BAD_CAMERAS = [
     ("viewmat", ValueError, MIRRORED),
     ("viewmat", ValueError, changed(torch.eye(4), (3, 0), 0.5)),
     ("viewmat", ValueError, changed(torch.eye(4), (1, 3), float("nan"))),
-    ("viewmat", ValueError, changed(torch.eye(4), (1, 3), float("inf"))),
     ("viewmat", ValueError, torch.eye(3)),
-    ("viewmat", ValueError, torch.eye(4)[None]),
     ("viewmat", TypeError, torch.eye(4).int()),
     ("viewmat", TypeError, "eye"),
     ("viewmat", ValueError, torch.eye(3).tolist()),
     ("viewmat", TypeError, [[1.0, 0.0], [1.0]]),
-    ("viewmat", TypeError, None),
     ("K", ValueError, changed(K, (0, 1), 0.5)),
     ("K", ValueError, changed(K, (0, 0), -20.0)),
-    ("K", ValueError, changed(K, (1, 1), 0.0)),
     ("K", ValueError, changed(K, (0, 2), float("nan"))),
     ("K", ValueError, changed(K, (2, 2), 2.0)),
     ("K", ValueError, torch.eye(4)),
     ("K", TypeError, 20.0),
-    ("K", ValueError, changed(K, (0, 2), float("nan")).numpy()),
     ("width", ValueError, 0),
     ("width", TypeError, 16.0),
     ("height", ValueError, -1),
@@ -104,27 +97,20 @@ def test_cameras_take_arrays_and_lists(convert: Callable[[torch.Tensor], Any]) -
 BAD_SURFELS = [
     ("means", ValueError, lambda means: means[:, :2]),
     ("means", ValueError, lambda means: changed(means, (2, 1), float("nan"))),
-    ("means", TypeError, lambda means: means.int()),
     ("means", TypeError, lambda means: means.tolist()),
     ("quats", ValueError, lambda quats: quats[:-1]),
-    ("quats", ValueError, lambda quats: quats[:, :3]),
     ("quats", ValueError, lambda quats: torch.where(torch.arange(8)[:, None] == 3, 0.0, quats)),
     ("quats", ValueError, lambda quats: changed(quats, (0, 0), float("inf"))),
     ("scales", ValueError, lambda scales: scales[:, :1]),
     ("scales", ValueError, lambda scales: changed(scales, (4, 1), 0.0)),
-    ("scales", ValueError, lambda scales: changed(scales, (4, 1), -1.0)),
     ("scales", TypeError, lambda scales: scales.double()),
     ("opacities", ValueError, lambda opacities: opacities[:, None]),
     ("opacities", ValueError, lambda opacities: changed(opacities, (1,), 1.5)),
-    ("opacities", ValueError, lambda opacities: changed(opacities, (1,), -0.1)),
     ("opacities", ValueError, lambda opacities: changed(opacities, (1,), float("nan"))),
     ("gammas", ValueError, lambda gammas: gammas[:, 0]),
     ("gammas", ValueError, lambda gammas: changed(gammas, (5, 0), 0.5)),
-    ("gammas", ValueError, lambda gammas: changed(gammas, (5, 0), float("inf"))),
     ("sh", ValueError, lambda sh: sh[:, :5]),
-    ("sh", ValueError, lambda sh: sh[:, :0]),
     ("sh", ValueError, lambda sh: sh[..., :2]),
-    ("sh", ValueError, lambda sh: sh.flatten(1)),
     ("sh", ValueError, lambda sh: changed(sh, (7, 15, 2), float("nan"))),
     ("sh", TypeError, lambda sh: sh.half()),
 ]
@@ -137,13 +123,6 @@ def test_bad_surfels(argument: str, error: type[Exception], spoil: Callable[[Any
     nw.Surfels.from_activated(**values)
     spoiled = values | {argument: spoil(values[argument])}
     assert_refused(error, argument, nw.Surfels.from_activated, **spoiled)
-
-
-@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
-def test_surfels_take_any_degree(coefficients: int) -> None:
-    scene = random_scene(8, sh_degree=MAX_SH_DEGREE)
-    scene["sh"] = scene["sh"][:, :coefficients]
-    assert make_surfels(scene).sh.shape == (8, coefficients, 3)
 
 
 def test_surfels_are_fresh_leaves() -> None:
@@ -177,18 +156,12 @@ BAD_TEXTURES = [
     ("levels", ValueError, 0),
     ("levels", TypeError, 2.5),
     ("table_size", ValueError, 1000),
-    ("table_size", ValueError, 0),
-    ("features", ValueError, 0),
     ("features", ValueError, 3),
-    ("features", ValueError, -2),
     ("min_resolution", ValueError, 0.0),
-    ("min_resolution", ValueError, float("nan")),
     ("max_resolution", ValueError, 1.0),
-    ("max_resolution", ValueError, float("inf")),
     ("width", ValueError, 0),
     ("hidden_layers", ValueError, -1),
     ("sh_degree", ValueError, 4),
-    ("sh_degree", ValueError, -1),
 ]
 
 
@@ -198,13 +171,6 @@ def test_bad_texture(argument: str, error: type[Exception], value: Any) -> None:
     good |= {"min_resolution": 2.0, "max_resolution": 8.0}
     nw.NeuralTexture(**good)
     assert_refused(error, argument, nw.NeuralTexture, **(good | {argument: value}))
-
-
-def test_texture_shapes() -> None:
-    texture = nw.NeuralTexture(levels=3, table_size=2**6, features=2, min_resolution=2.0, max_resolution=8.0)
-    assert texture.grid.shape == (3, 64, 2)
-    assert [tuple(matrix.shape) for matrix in texture.mlp.parameters()] == [(64, 6), (64, 64), (48, 64)]
-    assert texture.resolutions.tolist() == pytest.approx([2.0, 4.0, 8.0])
 
 
 # Render
@@ -218,7 +184,6 @@ BAD_RENDERS = [
     ("sh_degree", TypeError, "3"),
     ("background", ValueError, (0.0, 0.0)),
     ("background", ValueError, torch.zeros(4)),
-    ("background", ValueError, torch.zeros(1, 3)),
     ("background", (TypeError, ValueError), "black"),
     ("background", (TypeError, ValueError), None),
     ("surfels", TypeError, None),
@@ -243,12 +208,6 @@ def test_render_refuses_to_mix_dtypes() -> None:
     assert_refused(TypeError, "surfels|means", nw.render, surfels.half(), None, camera)
 
 
-def test_render_refuses_to_mix_devices() -> None:
-    scene = random_scene(4)
-    surfels, camera = make_surfels(scene), make_camera(scene)
-    assert_refused(ValueError, "texture", nw.render, surfels, make_texture(device="meta"), camera)
-
-
 @pytest.mark.cuda
 def test_render_refuses_to_mix_cuda_and_cpu() -> None:
     scene, there = random_scene(4), random_scene(4, device="cuda")
@@ -256,9 +215,3 @@ def test_render_refuses_to_mix_cuda_and_cpu() -> None:
     assert_refused(ValueError, "camera|viewmat", nw.render, surfels, None, make_camera(there))
     camera = make_camera(scene)
     assert_refused(ValueError, "texture", nw.render, surfels, make_texture(device="cuda"), camera)
-
-
-def test_camera_keys_are_its_arguments() -> None:
-    scene = random_scene(1)
-    camera = nw.Camera(*(scene[key] for key in CAMERA_KEYS))
-    assert (camera.width, camera.height, camera.near) == (23, 18, 0.01)

@@ -132,22 +132,6 @@ def test_half_precision_is_left_where_it_could_overflow(stored: Path, tmp_path: 
         assert present(load(file).texture).half_precision == fits
 
 
-def test_half_precision_has_the_same_bounds(stored: Path, tmp_path: Path) -> None:
-    """Sums of a matrix's rows may be larger than half precision holds."""
-    file = tmp_path / "model.safetensors"
-    file.write_bytes(stored.read_bytes())
-
-    def change(tensors: dict[str, torch.Tensor], _: dict[str, Any]) -> None:
-        halves = {name: x.half() for name, x in tensors.items() if "footprints" not in name}
-        tensors.update(halves | {MATRICES[-1]: torch.full_like(halves[MATRICES[-1]], 3e4)})
-
-    rewrite(file, change)
-    check_pictures(load(file), tiny_camera(), "half precision")
-    rewrite(file, lambda tensors, _: tensors.update({MATRICES[0]: torch.full_like(tensors[MATRICES[0]], torch.inf)}))
-    with pytest.raises(ValueError, match=r"texture.mlp.0.weight: expected values from -65504 to 65504, got inf at"):
-        load(file)
-
-
 def test_the_bounds_are_those_of_every_tensor(stored: Path) -> None:
     tensors: dict[str, torch.Tensor] = {}
     rewrite(stored, lambda found, _: tensors.update(found))
@@ -257,14 +241,3 @@ def test_a_number_of_a_camera_is_refused_or_renders_finite(stored: Path, tmp_pat
             continue
         assert math.isfinite(value) and not (name.endswith("[3]") and abs(value) >= 1e30), name
         check_pictures(model, camera, f"{name} = {value}")
-
-
-def test_integers_that_no_float_can_hold_are_refused() -> None:
-    camera = tiny_camera()
-    with pytest.raises(ValueError, match="near: expected at least 0 and at most 1e\\+16, got 1000"):
-        nw.Camera(camera.viewmat, camera.K, 16, 12, near=10**40)
-    with pytest.raises(
-        ValueError, match="background: expected at least -1e\\+06 and at most 1e\\+06, got 1000"
-    ) as caught:
-        nw.RenderOptions(background=(10**400, 0, 0))
-    assert len(str(caught.value)) < 200

@@ -136,25 +136,6 @@ def test_normals_are_the_mean_over_all_hits_and_face_the_camera(device: torch.de
     assert ((full.normals.norm(dim=-1)[hit] - 1).abs() < 1e-5).all()
 
 
-def test_a_single_quad_has_its_depths_and_normal() -> None:
-    """A wall across z = 2, seen head on: every depth is 2, the normal is -z."""
-    eye = torch.eye(4)
-    surfels = nw.Surfels.from_activated(
-        torch.tensor([[0.0, 0.0, 2.0]]),
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        torch.full((1, 2), 10.0),
-        torch.tensor([0.8]),
-        torch.full((1, 2), 4.0),
-        torch.zeros(1, 1, 3),
-    )
-    camera = nw.Camera(eye, torch.tensor([[20.0, 0, 8], [0, 20, 8], [0, 0, 1]]), 16, 16)
-    buffers = render_buffers(nw.Model(surfels, None), camera, max_hits=0)
-    two = torch.full((16, 16), 2.0)
-    for name in ("expected_depth", "median_depth", "top_depth"):
-        assert torch.allclose(getattr(buffers, name), two), name
-    assert buffers.normals.equal(torch.tensor([0.0, 0.0, -1.0]).expand(16, 16, 3))
-
-
 def test_nothing_in_view(tmp_path: Path) -> None:
     scene = random_scene(4)
     surfels = nw.Surfels.from_activated(
@@ -185,19 +166,3 @@ def test_bad_files_are_refused(tmp_path: Path) -> None:
     save_exr(tmp_path / "other.exr", {"image": torch.zeros(3, 4, 3)})
     with pytest.raises(ValueError, match=r"other\.exr: expected the buffers of a nexwarp rendering"):
         load_buffers(tmp_path / "other.exr")
-
-
-def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
-    buffers = make()
-    (tmp_path / "file").write_text("kept")
-    with pytest.raises(OSError, match="file"):
-        save_buffers(tmp_path / "file" / "a.exr", buffers)
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(OSError, match="expected a file to write, found a folder"):
-        save_buffers(tmp_path / "folder", buffers)
-    assert {f.name for f in tmp_path.rglob("*")} == {"file", "folder"}
-    with pytest.raises(TypeError, match=r"parts\['x'\]: expected float32 or int32, got torch.float64"):
-        save_exr(tmp_path / "new" / "a.exr", {"x": torch.zeros(3, 4).double()})
-    with pytest.raises(ValueError, match=r"parts\['x'\]: expected shape \(H, W\) or \(H, W, 3\), got \(3, 4, 2\)"):
-        save_exr(tmp_path / "new" / "a.exr", {"x": torch.zeros(3, 4, 2)})
-    assert not (tmp_path / "new").exists()

@@ -12,9 +12,9 @@ from nexwarp.model.detail_limits import NEVER, DetailLimits
 from nexwarp.model.render import antialiased
 from nexwarp.model.render import draw as draw_parts
 from nexwarp.train.finish.detail_limits import measure_detail_limits
-from tests.render_support import BACKGROUND, MAX_HITS, assert_alike, assert_same, draw
+from tests.render_support import BACKGROUND, MAX_HITS, assert_same
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
-from tests.tolerances import assert_close, assert_finite
+from tests.tolerances import assert_close
 
 
 def textured_at(texture: nw.NeuralTexture, camera: nw.Camera, out: nw.Rendering, depths: torch.Tensor) -> torch.Tensor:
@@ -55,17 +55,6 @@ def test_a_closer_look_finds_the_detail_of_training(device: torch.device) -> Non
     assert_close(out.textured, expected, kind="value", name="textured")
     far = (out.ids < 0) | (out.depths > 3.5)
     assert_close(out.textured[far.all(-1)], plain.textured[far.all(-1)], kind="value", name="far")
-
-
-def test_what_training_never_textured_keeps_its_plain_colour(device: torch.device) -> None:
-    scene = random_scene(device=device)
-    surfels, texture, camera = make_surfels(scene), make_texture(device=device, residual=True), make_camera(scene)
-    out = limited(surfels, texture, camera, limits(surfels, nearest=NEVER), background=BACKGROUND)
-    assert_alike(out, draw(scene))
-    out.image.sum().backward()
-    for name, parameter in surfels.named_parameters():
-        assert parameter.grad is not None
-        assert_finite(parameter.grad, name)
 
 
 def test_a_farther_look_keeps_the_detail_of_training(device: torch.device) -> None:

@@ -12,7 +12,6 @@ import nexwarp as nw
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.io.pictures import to_uint8
-from nexwarp.model import exposures
 from nexwarp.model.buffers import load_buffers, render_buffers, save_buffers
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
@@ -118,16 +117,6 @@ def test_gains_are_found_up_to_their_mean():
         assert abs(found - expected.numpy()).max() < bound
 
 
-def test_gains_do_not_depend_on_the_order_of_photos_or_points():
-    cameras, photos, points = photographs(torch.tensor([[0.2, 0.1, 0.0], [-0.3, 0.0, 0.1], [0.1, -0.1, -0.1]]))
-    found, falloff = photo_gains(cameras, photos, points)
-    order = [2, 0, 1]
-    shuffled = [points[i].flip(0) for i in order]
-    again, same = photo_gains([cameras[i] for i in order], [photos[i] for i in order], shuffled)
-    np.testing.assert_allclose(again, found[order], atol=2e-6)
-    np.testing.assert_allclose(same, falloff, atol=2e-6)
-
-
 @pytest.mark.parametrize("lens", [(-0.5, 0.0), (-0.1, -1.0), (0.3, -1.8)])
 def test_the_falloff_of_the_lens_is_found(lens):
     """With gains and outliers beside it; as a function, since its two powers are alike."""
@@ -196,15 +185,6 @@ def test_a_capture_of_one_exposure_is_left_alone(tmp_path):
     shaded = even._replace(color=even.color + 0.1 * (side * np.linspace(-1, 1, 8)[even.view])[:, None])
     assert abs(fit_exposures(shaded, cameras, vignetting=False).gains).max() > 0.02
     assert choose_fit(shaded, cameras) is None
-
-
-def test_a_single_point_tells_no_exposures():
-    """It cannot be cut in two."""
-    cameras, photos, points = photographs(torch.linspace(-0.3, 0.3, 5)[:, None].expand(5, 3).double())
-    shared = set.intersection(*({tuple(place) for place in seen.tolist()} for seen in points))
-    chosen = torch.tensor(sorted(shared)[:1])
-    seen = observations(views(cameras, photos, [chosen] * 5))
-    assert len(seen.view) == 5 and choose_fit(seen, cameras) is None
 
 
 def test_the_falloff_has_a_gate_of_its_own():
@@ -291,34 +271,12 @@ def test_a_camera_gets_the_gains_around_it():
     assert (far - course.mean(0)).abs().max() < 0.3
 
 
-def test_gains_that_nothing_predicts_are_smoothed():
-    """Each photo's own: the process does not follow what its neighbours do not share."""
-    noise = 0.2 * torch.randn(40, 3, generator=torch.Generator().manual_seed(0))
-    cameras = [looking(x) for x in np.linspace(0, 4, 40)]
-    exposures = Exposures.of(noise, cameras)
-    between = torch.stack([exposures.gains(looking(x)).log() for x in np.linspace(0.05, 3.95, 39)])
-    assert between.std() < 0.6 * noise.std()
-
-
 def test_many_photos_are_thinned():
     cameras = [looking(x) for x in np.linspace(0, 4, 2100)]
     course = torch.linspace(-0.3, 0.3, 2100)[:, None].expand(2100, 3)
     exposures = Exposures.of(course, cameras)
     assert len(exposures.log_gains) == 700
     torch.testing.assert_close(exposures.gains(cameras[1000]).log(), course[1000], atol=0.005, rtol=0)
-
-
-def test_directions_count_as_positions_do():
-    cameras = [looking(0.0, turn) for turn in (-0.4, 0.0, 0.4)] + [looking(3.0)]
-    exposures = Exposures.of(torch.tensor([[0.3] * 3, [0.0] * 3, [-0.3] * 3, [0.1] * 3]), cameras)
-    left, right = (exposures.gains(looking(0.0, turn)).log()[0] for turn in (-0.39, 0.39))
-    assert left > right + 0.1
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_cameras_in_one_place(count):
-    exposures = Exposures.of(torch.full((count, 3), 0.2), [looking(0.0)] * count)
-    torch.testing.assert_close(exposures.gains(looking(1.0)).log(), torch.full((3,), 0.2))
 
 
 def test_gains_follow_a_scene_that_is_moved_and_scaled():
@@ -429,41 +387,6 @@ def test_training_takes_exposures_out(tmp_path):
     model, figure = trained(scene, exposures=True)
     assert (present(model.exposures).log_gains - expected[:, None]).abs().max() < 0.03
     assert figure > without + 0.5
-
-
-def test_training_takes_vignetting_out(tmp_path):
-    """Photos through a lens that leaves 60 % of the light in the corners."""
-    scene = nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400))
-    cameras = [view.camera for view in scene.train]
-    corner = max(((c.width / 2 / c.fx) ** 2 + (c.height / 2 / c.fy) ** 2) for c in cameras)
-    lens = Exposures.of(torch.zeros(len(cameras), 3), cameras, (0.0, float(np.log(0.6)), corner))
-
-    def dark(views: list[View]) -> list[View]:
-        falloffs = [present(lens.falloff_of(view.camera)) for view in views]
-        darker = [to_uint8(view.image / 255 * falloff) for view, falloff in zip(views, falloffs, strict=True)]
-        return [dataclasses.replace(view, image=image) for view, image in zip(views, darker, strict=True)]
-
-    scene = dataclasses.replace(scene, train=dark(scene.train), test=dark(scene.test))
-    camera = scene.test[0].camera
-    even, without = trained(scene, exposures=False)
-    assert even.exposures is None
-    model, figure = trained(scene)
-    found = present(present(model.exposures).falloff_of(camera))
-    assert (found - present(lens.falloff_of(camera))).abs().max() < 0.08
-    assert figure > without + 0.2
-
-
-def test_each_of_many_photos_has_its_own_gains(tmp_path, monkeypatch):
-    """Renderings take theirs from some of the photos; training takes out what each has."""
-    scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=12, points=60)))
-    texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
-    config = Config(iterations=20, max_surfels=40, texture=texture)
-    expected = present(Trainer(scene, config, "cpu").views.gains)
-    monkeypatch.setattr(exposures, "MOST_PHOTOS", 4)
-    trainer = Trainer(scene, config, "cpu")
-    assert len(present(trainer.exposures).log_gains) <= 4 < len(scene.train)
-    assert torch.equal(present(trainer.views.gains), expected) and expected.shape == (len(scene.train), 3)
-    trainer.run()
 
 
 @pytest.mark.parametrize("change", [{"exposures": False}, {"mask_mode": "background"}])

@@ -31,7 +31,6 @@ FIELDS = ("image", "plain", "textured", "ids", "depths", "weights", "alpha")
 LAZY = ("expected_depth", "median_depth", "top_depth", "normals")
 OPTIONS = nw.RenderOptions(max_hits=3, background=(0.2, 0.5, 0.9), sh_degree=2)
 FALLOFF = (-0.3, -0.2, 0.4)
-PARAMETERS = {"means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN"}
 
 
 def cameras_of(device: torch.device | str = "cpu") -> list[nw.Camera]:
@@ -127,14 +126,6 @@ def test_options_take_the_exposure_and_the_limits_away(
     assert torch.equal(model.render(camera, exposure="photos", detail_limits=True).image, images[0])
 
 
-def test_the_mean_exposure_is_the_picture_without_gains(device: torch.device) -> None:
-    model, camera = full_model(device), cameras_of(device)[0]
-    assert model.exposures is not None
-    factors = model.exposures.factors(camera)
-    assert factors.shape == (camera.height, camera.width, 3) and factors.std() > 0.05
-    assert torch.equal(model.render(camera).image, model.render(camera, exposure="mean").image * factors)
-
-
 def test_changes_are_options_of_one_rendering(device: torch.device) -> None:
     model, camera = full_model(device), cameras_of(device)[0]
     before = model.options
@@ -191,20 +182,6 @@ def test_rendering_changes_nothing(device: torch.device) -> None:
     assert model.state_dict().keys() == before.keys()
     for name, x in model.state_dict().items():
         assert torch.equal(x, before[name]), name
-
-
-def test_surfels_hold_parameters_only() -> None:
-    model = full_model()
-    model.render(cameras_of()[0])
-    for surfels in (model.surfels, nw.Surfels(model.surfels.state_dict())):
-        assert {name for name, _ in surfels.named_parameters()} == PARAMETERS == surfels.state_dict().keys()
-        assert not list(surfels.buffers()) and not list(surfels.children())
-    assert {name.partition(".")[0] for name in model.state_dict()} == {
-        "surfels",
-        "texture",
-        "exposures",
-        "detail_limits",
-    }
 
 
 def test_four_functions_lead_to_the_first_op(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -275,23 +252,6 @@ def test_gradients_are_those_of_the_pure_rendering(device: torch.device) -> None
         assert gradient.abs().max() > 0, name
         if device.type == "cpu":
             assert torch.equal(gradient, found[1][name]), name
-
-
-def test_a_model_can_be_trained() -> None:
-    """Its parameters are those of the surfels and the texture; exposures and detail limits are constants."""
-    model, camera = full_model(), cameras_of()[0]
-    names = {name for name, _ in model.named_parameters()}
-    assert {name.partition(".")[0] for name in names} == {"surfels", "texture"}
-    target = torch.full((camera.height, camera.width, 3), 0.5)
-    optimizer = torch.optim.Adam(model.parameters(), lr=0.01)
-    losses = []
-    for _ in range(8):
-        optimizer.zero_grad()
-        loss = (model.render(camera).image - target).square().mean()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.9 * losses[0]
 
 
 # Copies and files

@@ -174,14 +174,6 @@ def many_frames(folder: Path) -> tuple[Path, Callable[[], object]]:
     return write_frames(folder, MANY), lambda: nw.load_scene(folder)
 
 
-def duplicate_frames(folder: Path) -> tuple[Path, Callable[[], object]]:
-    from PIL import Image
-
-    (folder / "images").mkdir()
-    Image.new("RGB", (8, 6)).save(folder / "images" / "1.png")
-    return write_frames(folder, 29_000), lambda: nw.load_scene(folder)
-
-
 def long_path(folder: Path) -> tuple[Path, Callable[[], object]]:
     entries = repeated(json.dumps({"camera_to_world": [x for row in POSE for x in row], "fov": 50}), MANY)
     file = folder / "path.json"
@@ -205,21 +197,13 @@ def many_tensors(folder: Path) -> tuple[Path, Callable[[], object]]:
     return file, lambda: nw.load(file)
 
 
-def many_checkpoint_tensors(folder: Path) -> tuple[Path, Callable[[], object]]:
-    save_checkpoint(folder, {}, {})
-    many_tensors(folder)[0].rename(folder / "checkpoint" / "tensors.safetensors")
-    return folder / "checkpoint", lambda: load_checkpoint(folder)
-
-
 @pytest.mark.parametrize(
     ("make", "match"),
     [
         (many_frames, "expected at most 500,000 lists and objects, got 900,"),
-        (duplicate_frames, "expected each photo once, got 1.png twice"),
-        (long_path, "camera_path: expected at most 30,000 cameras, got 150,000"),
+        (long_path, "camera_path: expected a list of at least one camera, at most 30,000"),
         (many_cameras, "expected at most 500,000 lists and objects, got 1,500,003"),
         (many_tensors, "expected a safetensors header of at most 1,048,576 bytes"),
-        (many_checkpoint_tensors, "expected a safetensors header of at most 1,048,576 bytes"),
     ],
 )
 def test_too_many_entries_are_refused_at_once(tmp_path: Path, make: Callable[..., Any], match: str) -> None:
@@ -227,9 +211,3 @@ def test_too_many_entries_are_refused_at_once(tmp_path: Path, make: Callable[...
     begun = time.process_time()
     refused(ValueError, read, names=file, match=match)
     assert time.process_time() - begun < 2.0
-
-
-def test_a_few_tensors_more_are_no_matter(tmp_path: Path) -> None:
-    file = save_model(tmp_path, tiny_model())
-    rewrite(file, lambda tensors, _: tensors.update({f"x{i}": torch.zeros(1) for i in range(1000)}))
-    assert len(nw.load(file).surfels) == 12

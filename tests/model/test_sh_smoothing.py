@@ -13,7 +13,7 @@ from nexwarp.data import Scene, View
 from nexwarp.model.surfels import Surfels
 from nexwarp.train.finish import sh_smoothing
 from nexwarp.train.finish.sh_smoothing import seen_directions, smooth_sh
-from nexwarp.train.recipe import MAX_STRENGTH, MIN_STRENGTH, Config, TextureConfig, preset
+from nexwarp.train.recipe import MAX_STRENGTH, MIN_STRENGTH, Config, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.reference.sh import basis as sh_basis
 from tests.scene_writers import write_demo
@@ -214,16 +214,3 @@ def test_finishing_leaves_the_training_as_it_is(scene: Scene, device: torch.devi
         assert torch.equal(a, b), name
     for name, x in model.surfels.state_dict().items():
         assert torch.equal(x, kept[name]), name
-
-
-@pytest.mark.usefixtures("one_torch_thread")
-def test_presets_without_it_keep_what_was_learnt(scene: Scene) -> None:
-    assert preset("paper").smooth_sh == 0.0 and preset("default").smooth_sh == 0.01
-    trainer = Trainer(scene, Config(iterations=20, max_surfels=200, smooth_sh=0.0), "cpu")
-    trainer.run()
-    model = trainer.finish()
-    kept, learnt = (surfels.shN.unique(dim=0) for surfels in (model.surfels, trainer.surfels))  # in whichever order
-    assert torch.equal(kept, learnt) and model.meta["smooth_sh"] == 0.0
-    for value in (-1.0, 1e-7, 2 * MAX_STRENGTH, math.nan):
-        with pytest.raises(ValueError, match="smooth_sh"):
-            Config(smooth_sh=value)

@@ -47,15 +47,6 @@ def graphs_of(trainer: Trainer) -> int:
     return sum(stage.graph is not None for stage in trainer.graphs.stages.values())
 
 
-def masked(scene: Scene) -> Scene:
-    def view(v: View) -> View:
-        mask = torch.ones(v.image.shape[:2], dtype=torch.bool)
-        mask[: len(mask) // 4] = False
-        return dataclasses.replace(v, mask=mask)
-
-    return dataclasses.replace(scene, train=[view(v) for v in scene.train])
-
-
 def half(view: View) -> View:
     """A view of the left half of the photo."""
     camera, width = view.camera, view.camera.width // 2
@@ -109,13 +100,6 @@ def test_the_first_step_after_a_round_is_captured(tiny_scene: Scene, monkeypatch
     assert sum(iteration + 1 in launched for iteration in rounds) <= len(rounds) // 2
 
 
-@pytest.mark.parametrize("mode", ["ignore", "background"])
-def test_masks_too(tiny_scene: Scene, mode: str) -> None:
-    scene = masked(tiny_scene)
-    launched = trained(scene, cuda_graphs=False, mask_mode=mode)
-    assert_same_state(trained(scene, mask_mode=mode), launched)
-
-
 def test_teachers_too(tiny_scene: Scene) -> None:
     """Steps with a teacher's picture have the graph of steps with photos."""
     teachers, runs = [trained(tiny_scene, seed=seed).finish() for seed in (1, 2)], []
@@ -136,18 +120,6 @@ def test_each_step_has_its_own_losses(tiny_scene: Scene) -> None:
         seen[graphs] = [trainer.step().losses for _ in range(40)]
     for launched, replayed in zip(seen[False], seen[True], strict=True):
         assert {k: v.item() for k, v in launched.items()} == {k: v.item() for k, v in replayed.items()}
-
-
-def test_resuming_changes_nothing(tiny_scene: Scene, tmp_path: Any) -> None:
-    straight = trained(tiny_scene)
-    first = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
-    for _ in range(57):
-        first.step()
-    first.save(tmp_path)
-    second = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
-    second.restore(tmp_path)
-    second.run()
-    assert_same_state(second, straight)
 
 
 @pytest.mark.parametrize("forgotten", [10**6, 0], ids=["launched", "make room"])
