@@ -52,11 +52,7 @@ class StorageError(NexwarpError, OSError):
 
 
 class DivergedError(NexwarpError, RuntimeError):
-    """A training produced NaN or infinity; `report` holds facts about it, as JSON values."""
-
-    def __init__(self, message: str, report: Mapping[str, object] | None = None) -> None:
-        super().__init__(message)
-        self.report: dict[str, object] = dict(report or {})
+    """A training produced NaN or infinity."""
 
 
 class RankError(NexwarpError, RuntimeError):

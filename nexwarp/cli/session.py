@@ -23,7 +23,6 @@ from nexwarp.model.model_file import MODEL_FILE, load, save_model
 from nexwarp.run.evaluate import evaluate
 from nexwarp.run.folder import (
     COMPARE,
-    DIVERGED_FILE,
     METRICS_FILE,
     RENDERS_FOLDER,
     TRAIN,
@@ -195,18 +194,16 @@ class Session:
         return None
 
     def _diverged(self, folder: Path, trainer: Trainer, error: DivergedError) -> DivergedError:
-        """Write a report and the last good model, which the trainer has restored; return the error to raise."""
-        report = {"message": str(error), **error.report}
-        outcome = f"the model of iteration {trainer.iteration:,} and a report, {DIVERGED_FILE}, are in {folder}"
+        """Write the last good model, which the trainer has restored; return the error to raise."""
+        outcome = f"the model of iteration {trainer.iteration:,} is in {folder}"
         try:
             if self.ranks.first:
-                write_json(folder / DIVERGED_FILE, report)
                 save_model(folder, trainer.model())
         except OSError as problem:
             outcome = f"the model of iteration {trainer.iteration:,} could not be saved ({problem})"
         outcome = str(self.ranks.share(outcome))
         self.ranks.barrier()
-        return DivergedError(f"{error}; {outcome}", report)
+        return DivergedError(f"{error}; {outcome}")
 
     def _write(self, stage: Stage, trainer: Trainer) -> Model:
         """Finish and write the model of a stage, its cameras and figures."""

@@ -44,7 +44,7 @@ from nexwarp.train.stages import NO_TEACHERS, OwnTeachers
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.json"
 LOG_FILE = "metrics.jsonl"
-DIVERGED_FILE = "diverged.json"
+DIVERGED_FILE = "diverged.json"  # of versions up to 0.2
 LOCK_FILE = "run.lock"
 WANDB_FILE = "wandb.json"  # the id of the run at Weights & Biases
 CAMERA_PATH = "camera_path_{}.json"

@@ -21,12 +21,7 @@ class FusedAdam(torch.optim.Adam):
     """
 
     def __init__(self, groups: list[dict[str, Any]], *, eps: float) -> None:
-        """Make an optimizer.
-
-        Args:
-            groups: parameter groups; their learning rates are numbers, or tensors on the parameters' device.
-            eps: added to the denominator.
-        """
+        """Make an optimizer of groups whose learning rates are numbers, or tensors on the parameters' device."""
         capturable = all(isinstance(group["lr"], torch.Tensor) and group["lr"].is_cuda for group in groups)
         super().__init__(groups, eps=eps, fused=True, capturable=capturable)
         self.grid_loss: torch.Tensor | None = None
@@ -45,9 +40,7 @@ class FusedAdam(torch.optim.Adam):
     def regularise(self, texture: NeuralTexture, factors: torch.Tensor | None) -> None:
         """Take over a texture's grid: update its half-precision copy, and add sum_l factors[l] sum(H_l^2) to the loss.
 
-        Args:
-            texture: whose grid is among the parameters.
-            factors: (L,) factors; None adds nothing.
+        Of the (L,) `factors`, None adds nothing.
         """
         self._texture, self._factors = texture, factors
         if texture.grid.is_cuda:
@@ -58,10 +51,11 @@ class FusedAdam(torch.optim.Adam):
         """Do one step; gradients stay as they are."""
         if closure is not None:
             raise TypeError("closure: expected None; a loss is evaluated once a step")
-        grid = None if self._texture is None else self._texture.grid
+        texture = self._texture
+        grid = None if texture is None else texture.grid
         half = None
-        if self._texture is not None and (self._texture.grid.is_cuda or self._texture.half_copy_key() is not None):
-            half = self._texture.half_copy()
+        if texture is not None and (texture.grid.is_cuda or texture.half_copy_key() is not None):
+            half = texture.half_copy()
         steps: list[torch.Tensor] = []
         work = []
         for group in self.param_groups:
@@ -93,11 +87,5 @@ class FusedAdam(torch.optim.Adam):
 
 
 def grid_factors(texture: NeuralTexture, weights: LossWeights, cells_unit: float) -> torch.Tensor | None:
-    """Return the factors (L,) of the grid's loss, of which `losses.grid_loss` has 1 / s^3; None where it is not used.
-
-    Args:
-        texture: whose resolutions count.
-        weights: whose `grid` counts.
-        cells_unit: world units in which the loss counts its cells.
-    """
+    """Return the factors (L,) of the grid's loss, of which `losses.grid_loss` has 1 / s^3; None without any."""
     return weights.grid / (texture.resolutions * cells_unit) ** 3 if weights.grid > 0 else None

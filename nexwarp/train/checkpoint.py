@@ -5,7 +5,7 @@ import json
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -15,23 +15,25 @@ from nexwarp.io.json_files import READ_ERRORS, read_json
 from nexwarp.io.safetensors_files import check_tensors_header
 
 CHECKPOINT_VERSION = 1
-
-# Newest first. The last one is there only while others are renamed.
-CHECKPOINTS = ("checkpoint", "checkpoint.old", "checkpoint.older")
+CHECKPOINTS = ("checkpoint", "checkpoint.old")
 TENSORS_FILE, STATE_FILE = CHECKPOINT_FILES = ("tensors.safetensors", "state.json")
 
 
+class Snapshot(NamedTuple):
+    """State of a training: tensors on the CPU by name, and the rest as JSON values."""
+
+    tensors: dict[str, torch.Tensor]
+    state: dict[str, Any]
+
+
 def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mapping[str, object]) -> None:
-    """Write everything that shapes the future of a run into `run/checkpoint`, whole or not at all.
+    """Write everything that shapes the future of a run into `run/checkpoint`; OSError where it cannot be written.
 
-    The one before stays, as `run/checkpoint.old`. A kill or a power cut at any moment leaves at least one whole.
-
-    Raises:
-        OSError: it cannot be written; what was there is as it was.
+    The one before becomes `run/checkpoint.old`. A kill or a power cut at any moment leaves at least one whole.
     """
     from safetensors.torch import save
 
-    newest, old, older = (run / name for name in CHECKPOINTS)
+    newest, old = (run / name for name in CHECKPOINTS)
     aside = temporary_name(newest)
     try:
         aside.mkdir()
@@ -39,17 +41,14 @@ def save_checkpoint(run: Path, tensors: Mapping[str, torch.Tensor], state: Mappi
         write_atomically(aside / TENSORS_FILE, content)
         record = {**state, "format_version": CHECKPOINT_VERSION, "tensors_sha256": hashlib.sha256(content).hexdigest()}
         write_atomically(aside / STATE_FILE, json.dumps({**record, "sha256": _digest(record)}).encode())
-        if newest.exists():  # else a kill came between the renames, and the others are all there is
-            if old.exists():
-                _make_way(older)
-                old.rename(older)
+        if newest.exists():  # else a kill came between the renames, and the old one is all there is
+            _make_way(old)
             newest.rename(old)
         aside.rename(newest)
         sync(run)
     except BaseException:  # whatever comes next may need the room
         _delete(aside)
         raise
-    _delete(older)
 
 
 def delete_checkpoints(run: Path) -> None:
@@ -61,8 +60,6 @@ def delete_checkpoints(run: Path) -> None:
 def _delete(folder: Path) -> None:
     """Delete a checkpoint. Files in its folder that are not ours stay, and so does the folder then."""
     with suppress(OSError):
-        if folder.is_symlink():
-            folder.unlink()
         for file in folder.iterdir():
             if file.name in CHECKPOINT_FILES or is_temporary(file.name):
                 file.unlink()
@@ -82,44 +79,34 @@ def _make_way(folder: Path) -> None:
 
 def has_checkpoint(run: Path) -> bool:
     """Whether there is a checkpoint, whole or not."""
-    return any(_is_checkpoint(run / name) for name in CHECKPOINTS)
+    return any((run / name / file).exists() for name in CHECKPOINTS for file in CHECKPOINT_FILES)
 
 
-def _is_checkpoint(folder: Path) -> bool:
-    return any((folder / name).exists() for name in CHECKPOINT_FILES)
-
-
-def load_checkpoint(
-    run: Path, warn: Callable[[str], None] = lambda _: None
-) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Read the newest whole one of what `save_checkpoint` wrote, on the CPU.
-
-    Args:
-        run: run folder.
-        warn: is told of a damaged one that is passed over.
+def load_checkpoint(run: Path, warn: Callable[[str], None] = lambda _: None) -> Snapshot:
+    """Read the newest whole checkpoint of a run folder; `warn` is told of a damaged one that is passed over.
 
     Raises:
-        FileNotFoundError: there is no checkpoint.
-        ValueError: all there are are damaged, or of another version.
+        MissingError: there is no checkpoint.
+        CheckpointError: all there are are damaged, or of another version.
     """
     damaged: list[CheckpointError] = []
     for folder in (run / name for name in CHECKPOINTS):
-        if not _is_checkpoint(folder):
+        if not any((folder / file).exists() for file in CHECKPOINT_FILES):
             continue
         try:
-            tensors, state = _read_checkpoint(folder)
+            snapshot = _read_checkpoint(folder)
         except CheckpointError as error:
             damaged.append(error)
             continue
-        for found in damaged:
-            warn(f"{found}; going back to the one before it, {folder.name}")
-        return tensors, state
+        for error in damaged:
+            warn(f"{error}; going back to the one before it, {folder.name}")
+        return snapshot
     if damaged:
         raise damaged[0]
     raise MissingError(f"{run}: expected a checkpoint to resume from, found none")
 
 
-def _read_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+def _read_checkpoint(folder: Path) -> Snapshot:
     from safetensors import SafetensorError
     from safetensors.torch import load
 
@@ -133,7 +120,7 @@ def _read_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, A
         if hashlib.sha256(content).hexdigest() != record.pop("tensors_sha256"):
             raise ValueError("tensors.safetensors: its checksum does not agree")
         del record["format_version"]
-        return load(content), record
+        return Snapshot(load(content), record)
     except (*READ_ERRORS, SafetensorError) as error:  # bad JSON and bad UTF-8 are ValueErrors
         raise CheckpointError(f"{folder}: expected a whole checkpoint, but it cannot be read ({error})") from None
 

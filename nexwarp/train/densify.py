@@ -3,7 +3,6 @@
 import torch
 from torch import nn
 
-from nexwarp.errors import check_range
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.train.recipe import DensifyConfig
 
@@ -16,14 +15,6 @@ class Densifier:
     """Sums of each surfel's blended error since the last split, and the rounds that use them up."""
 
     def __init__(self, config: DensifyConfig, surfels: Surfels, max_surfels: int) -> None:
-        """Start with zero sums.
-
-        Args:
-            config: when and how.
-            surfels: that will be densified, in place.
-            max_surfels: the budget; never exceeded.
-        """
-        check_range("max_surfels", max_surfels, 1)
         self.config = config
         self.max_surfels = max_surfels
         self.errors = torch.zeros_like(surfels.logit_opacities.detach())
@@ -54,19 +45,11 @@ class Densifier:
         generator: torch.Generator,
         unneeded: torch.Tensor | None = None,
     ) -> tuple[int, int]:
-        """Split and prune, in place; children start with optimizer state of zeros.
+        """Split and prune, in place, `unneeded` (N,) bool surfels too; return how many were split and how many pruned.
 
-        Where the budget is within reach of a round that prunes, second children take the rows of pruned surfels. A
-        round at the budget then changes no tensor's size or address, and CUDA graphs of training steps stay valid.
-
-        Args:
-            surfels: to change.
-            optimizer: holds their parameters; its state follows.
-            generator: for the choice, on the CPU.
-            unneeded: (N,) bool, surfels to prune beside the transparent ones; None is none.
-
-        Returns:
-            How many surfels were split and how many pruned.
+        Children start with optimizer state of zeros. Where the budget is within reach of a round that prunes, second
+        children take the rows of pruned surfels. A round at the budget then changes no tensor's size or address, and
+        CUDA graphs of training steps stay valid.
         """
         count, prunes = len(surfels), self.config.prune_at_cap
         if prunes and int((1 + self.config.fraction) * count) >= self.max_surfels:
@@ -89,10 +72,7 @@ class Densifier:
         generator: torch.Generator,
         unneeded: torch.Tensor | None,
     ) -> tuple[int, int]:
-        """Prune and split in one go, and put children in the rows of pruned surfels.
-
-        A round splits `fraction` of the surfels at most, and one more for each that is unneeded.
-        """
+        """Prune and split in one go, `fraction` of the surfels and one for each unneeded; children take pruned rows."""
         if unneeded is None:
             unneeded = torch.zeros_like(surfels.logit_opacities, dtype=torch.bool)
         spared = _most_opaque(surfels)
@@ -118,10 +98,7 @@ class Densifier:
         return surfels.opacities.detach() < self.config.prune_opacity
 
     def remove(self, surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: torch.Tensor) -> int:
-        """Remove, in place, the chosen (N,) bool surfels but for the most opaque ones of all; return how many.
-
-        A scene without surfels has no gradient to recover by.
-        """
+        """Remove the chosen (N,) bool surfels but for the most opaque ones, without which no gradient would be left."""
         keep = ~chosen | _most_opaque(surfels)
         removed = int((~keep).sum())
         if removed:
@@ -153,14 +130,8 @@ def split_surfels(
 ) -> None:
     """Replace each chosen surfel by two halves along its longer axis: scale / 2, centres at +-scale / 2.
 
-    The first child takes the parent's row, the second is appended.
-
-    Args:
-        surfels: N, to change.
-        optimizer: holds their parameters; its state follows, and is zero for children.
-        chosen: (M,) rows of the parents.
-        places: (M,) rows of the second children: ones that are no parent's, then N, N + 1 and so on for those to
-            append; None appends all. Tensors of parameters and optimizer stay the same where none is appended.
+    The first child takes the parent's row `chosen` (M,). The second takes that in `places` (M,): rows that are no
+    parent's, then N, N + 1 and so on for those to append; None appends all. The optimizer's state is zero for children.
     """
     count = len(surfels)
     if places is None:
@@ -193,11 +164,7 @@ def split_surfels(
 
 @torch.no_grad()
 def replace_rows(surfels: Surfels, optimizer: torch.optim.Optimizer, rows: torch.Tensor) -> None:
-    """Make the surfels the given rows (M,) of themselves, optimizer state included.
-
-    Tensors of the optimizer's state that have their parameter's shape get the same rows; everything else, such as the
-    number of steps, is kept as it is.
-    """
+    """Make the surfels the given rows (M,) of themselves, and so all optimizer state of their parameters' shapes."""
     for name in PARAMETERS:
         old = getattr(surfels, name)
         new = nn.Parameter(old.detach()[rows].contiguous())

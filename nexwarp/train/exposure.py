@@ -32,12 +32,9 @@ LEAST_WEIGHT = 1e-9  # of a point, so that nothing is divided by 0
 
 @dataclass(frozen=True)
 class ExposureCalibration:
-    """What the training photos tell of their exposures.
+    """Gains (V, 3) of V training photos, what predicts those of other cameras, and the points' colours at their mean.
 
-    Attributes:
-        exposures: predict the gains of other cameras.
-        gains: (V, 3) gains of the V training photos.
-        colors: (P, 3) float32 in [0, 1], colours of the scene's points at the mean exposure.
+    The colours (P, 3) of the scene's points are float32 in [0, 1].
     """
 
     exposures: Exposures
@@ -51,9 +48,7 @@ Calibrate = Callable[[Scene, Config], ExposureCalibration | None]
 def calibrate_exposures(scene: Scene, config: Config) -> ExposureCalibration | None:
     """Estimate the exposures of a scene's training photos.
 
-    Returns:
-        None where the photos have one exposure by their nature, or where their points do not show that exposures
-        differ (`choose_fit`).
+    None where they have one exposure by their nature, or where points do not show that exposures differ.
     """
     rendered = scene.background is not None or scene.random_background
     if not config.exposures or rendered or config.mask_mode == "background":
@@ -69,21 +64,13 @@ def calibrate_exposures(scene: Scene, config: Config) -> ExposureCalibration | N
 
 
 class Observations(NamedTuple):
-    """M observations of P points in photos.
+    """M observations of P points in photos."""
 
-    Attributes:
-        view: (M,) index of the photo.
-        point: (M,) index of the point.
-        color: (M, 3) log colour.
-        squares: (M,) squared tangent of the angle to the optical axis.
-        places: (P, 3) positions of the points, float32.
-    """
-
-    view: np.ndarray
-    point: np.ndarray
-    color: np.ndarray
-    squares: np.ndarray
-    places: np.ndarray
+    view: np.ndarray  # (M,) index of the photo
+    point: np.ndarray  # (M,) index of the point
+    color: np.ndarray  # (M, 3) log colour
+    squares: np.ndarray  # (M,) squared tangent of the angle to the optical axis
+    places: np.ndarray  # (P, 3) positions of the points, float32
 
     def of_points(self, chosen: np.ndarray) -> "Observations":
         """Return the observations of those points for which `chosen` (P,) is True."""
@@ -92,17 +79,11 @@ class Observations(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Exposures fitted to observations.
+    """Exposures fitted to observations."""
 
-    Attributes:
-        gains: (V, 3) log gains with mean 0.
-        lens: (2,) factors of t and t^2 in the logarithm of the falloff, where t = squares / largest.
-        largest: largest squared tangent of an observed point.
-    """
-
-    gains: np.ndarray
-    lens: np.ndarray
-    largest: float
+    gains: np.ndarray  # (V, 3) log gains with mean 0
+    lens: np.ndarray  # (2,) factors of t and t^2 in the logarithm of the falloff, where t = squares / largest
+    largest: float  # largest squared tangent of an observed point
 
     def powers(self, seen: Observations) -> np.ndarray:
         """Return t and t^2 (M, 2) of observations."""
@@ -143,14 +124,7 @@ def choose_fit(seen: Observations, cameras: Sequence[Camera]) -> Fit | None:
 
     Shading and drift along chains of matches also look like gains, but not like the same gains everywhere: the points
     are cut in two along each of their principal axes, and the fit to one half is judged at the other. Of many points,
-    every n-th is judged by.
-
-    Args:
-        seen: all observations.
-        cameras: cameras of the photos.
-
-    Returns:
-        The chosen fit to all points; None where gains do not lower the error of held-out points by `MARGIN`.
+    every n-th is judged by. None where gains do not lower the error of held-out points by `MARGIN`.
     """
     stride = max(-(-len(seen.places) // MOST_CHECKED), 1)
     halves = _halves(seen.of_points(np.arange(len(seen.places)) % stride == 0))
@@ -220,14 +194,7 @@ def _corner(camera: Camera) -> float:
 
 
 def solve_gains(seen: Observations, observed: np.ndarray, weights: np.ndarray, photos: int) -> np.ndarray:
-    """Return the log gains (V,), mean 0, of one channel of V photos: least squares.
-
-    Args:
-        seen: which photos show which points.
-        observed: (M,) log colours.
-        weights: (M,) of the squared errors.
-        photos: V.
-    """
+    """Return the log gains (V,), mean 0, of one channel of V photos by least squares of log colours (M,)."""
     from scipy.linalg import solve
     from scipy.sparse import csc_array, csr_array, diags_array
     from scipy.sparse.linalg import spsolve
@@ -273,7 +240,6 @@ def _means(point: np.ndarray, values: np.ndarray, weights: np.ndarray) -> np.nda
 
 def _point_colors(scene: Scene, seen: Observations, fit: Fit) -> torch.Tensor:
     """Return colours (P, 3) of the scene's points at the mean exposure; a point that no photo shows keeps its own."""
-    colors = scene.colors.float() / 255 if scene.colors.dtype == torch.uint8 else scene.colors.float()
     weights, _ = _robust(seen, fit, np.ones(seen.color.shape))
     _, left = _robust(seen, fit, weights)
     own = np.zeros(seen.places.shape)
@@ -281,4 +247,6 @@ def _point_colors(scene: Scene, seen: Observations, fit: Fit) -> torch.Tensor:
     row_of = {place.tobytes(): row for row, place in enumerate(seen.places)}
     rows = np.array([row_of.get(place.tobytes(), -1) for place in scene.points.numpy()], dtype=np.int64)
     shown = torch.from_numpy(rows >= 0)
-    return torch.where(shown[:, None], torch.from_numpy(np.exp(own[rows])).float(), colors).clamp(0, 1)
+    return torch.where(shown[:, None], torch.from_numpy(np.exp(own[rows])).float(), scene.colors.float() / 255).clamp(
+        0, 1
+    )

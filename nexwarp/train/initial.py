@@ -24,14 +24,7 @@ TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the
 def initial_surfels(
     scene: Scene, config: Config, generator: torch.Generator, colors: torch.Tensor | None = None
 ) -> Surfels:
-    """Surfels on the `starting_points`: half the budget at most (paper Sec. 4.3).
-
-    Args:
-        scene: its P points are taken.
-        config: settings.
-        generator: of random rotations, on the CPU.
-        colors: (P, 3) colours of the points; None takes the scene's.
-    """
+    """Surfels on the `starting_points`, of `colors` (P, 3) or the scene's: half the budget at most (paper Sec. 4.3)."""
     most = max(config.max_surfels // 2, 1)
     points = starting_points(scene, most, colors, skybox=config.skybox, filter_outliers=config.filter_points)
     count = len(points.means)
@@ -56,18 +49,10 @@ def starting_points(
     skybox: int = 0,
     filter_outliers: bool = True,
 ) -> InitialPoints:
-    """Choose points of the cloud by farthest point sampling, then points of a sphere around the scene.
+    """Choose `most` points of the cloud by farthest point sampling, and of a sphere around the scene, those last.
 
-    Args:
-        scene: its P points and its training views.
-        most: number of points, 1 or more.
-        colors: (P, 3) colours of the points; None takes the scene's.
-        skybox: number of points on the sphere, before those near the cloud are left out; a sixth of `most` at the
-            most, and none where photos are transparent.
-        filter_outliers: as in `initial_points`.
-
-    Returns:
-        At most `most` points, those of the sphere last.
+    Of the sphere's `skybox` points, those near the cloud are left out. They are a sixth of `most` at the most, and none
+    where photos are transparent.
     """
     # Behind transparent photos lies the background colour alone.
     count = 0 if scene.background is not None else min(skybox, most // SKYBOX_SHARE)
@@ -84,15 +69,7 @@ def starting_points(
 
 
 def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
-    """Turn rotations by the least angle so that their z axes lie along normals.
-
-    Args:
-        normals: (N, 3) unit.
-        quats: (N, 4) wxyz, any length but zero.
-
-    Returns:
-        (N, 4) unit, wxyz.
-    """
+    """Turn rotations (N, 4) wxyz by the least angle so that their z axes lie along unit normals (N, 3)."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     axis = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
     normals = torch.where((axis * normals).sum(-1, keepdim=True) < 0, -normals, normals)

@@ -20,10 +20,10 @@ from nexwarp.machine import derived_seed, needed_memory
 from nexwarp.model.graphs import Gradients, GraphKey, StepResult, UpdateError, capturing
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
+from nexwarp.train.checkpoint import Snapshot
 from nexwarp.train.ranks.ranks import GradientReducer, Ranks
 from nexwarp.train.recipe import Config
 from nexwarp.train.relocation import least_contributing
-from nexwarp.train.state import Snapshot
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 
@@ -65,10 +65,10 @@ class ParallelTrainer(Trainer):
         ranks.check_same(
             {
                 "settings": hashlib.sha256(json.dumps(config.as_dict(), sort_keys=True).encode()).hexdigest()[:12],
-                "training cameras": self.origin.views[:12],
-                "scene": self.origin.scene[:12],
+                "training cameras": self.origin["views"][:12],
+                "scene": self.origin["scene"][:12],
                 "background": str(self.background),
-                "teachers": self.origin.teachers[:12],
+                "teachers": self.origin.get("teachers", "")[:12],
             }
         )
         # The same already, unless the ranks' processors round differently.
@@ -156,11 +156,11 @@ class ParallelTrainer(Trainer):
         except DivergedError as error:
             fault = error
         sums = [x.detach().view(torch.int32).sum(dtype=torch.int64) for _, x in self._named_parameters()]
-        mine = {"fault": None if fault is None else [str(fault), fault.report], "sums": torch.stack(sums).tolist()}
+        mine = {"fault": None if fault is None else str(fault), "sums": torch.stack(sums).tolist()}
         records: list[Any] = self.ranks.gather(mine)
         for rank, record in enumerate(records):
             if record["fault"] is not None:
-                raise DivergedError(*record["fault"])
+                raise DivergedError(record["fault"])
             if record["sums"] != records[0]["sums"]:
                 raise RankError(
                     f"rank {rank}: its parameters at iteration {self.iteration:,} differ from those of rank 0"

@@ -1,7 +1,6 @@
-"""Finds the surfels that the training views need least, so that density control can use their place. Not in the paper.
+"""Finds the surfels that the training views need least, whose place density control can use. Not in the paper.
 
-Once the budget is used up, the paper's density control splits a surfel only where another becomes transparent. Few do,
-so that the surfels stay where the first iterations put them.
+Once the budget is used up, the paper's density control splits a surfel only where another becomes transparent: few do.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,13 +21,8 @@ def least_contributing(
     """Return (N,) bool, True for the share of the surfels that contribute least to any image.
 
     A surfel's contribution to an image is the sum of its blending weights over the pixels; what counts is the image to
-    which it contributes most. Images are rendered at half the size, each weighing all its pixels alike.
-
-    Args:
-        model: its N surfels and options are used.
-        cameras: of the training views, on any device.
-        share: of the surfels, 0 to 1; rounded down to whole surfels.
-        largest: takes the contributions (N,) to these images, and returns the largest of all ranks.
+    which it contributes most. Images are rendered at half the size, each weighing all its pixels alike. `largest` takes
+    the contributions (N,) to these images, and returns the largest of all ranks.
     """
     bare = model.bare()
     most = torch.zeros_like(bare.surfels.logit_opacities)

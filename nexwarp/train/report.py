@@ -16,8 +16,7 @@ class StepReport:
         losses: terms of the loss by name, factors included, scalars; own losses have their own names.
         image: (H, W, 3) the rendering, not clamped, before the step changed anything.
         target: (H, W, 3) float, the photo that it was compared with.
-        views: number of views of the step, by which the iteration has risen: one for each rank. Losses, image and
-            target are those of this rank's view.
+        views: number of views of the step, one for each rank; losses, image and target are those of this rank's.
     """
 
     iteration: int

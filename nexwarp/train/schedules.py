@@ -3,15 +3,13 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import torch
 
-from nexwarp.model.options import RenderOptions
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture
-from nexwarp.ops.tiles import Order
 from nexwarp.train.adam import FusedAdam, grid_factors
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config, DensifyConfig
 
@@ -44,10 +42,6 @@ def make_optimizer(
         make: makes an optimizer of one's own; None makes a `FusedAdam`, which regularises the grid.
         cells_unit: world units in which the grid's loss counts its cells.
         poses: pose corrections to train; None trains none.
-
-    Raises:
-        TypeError: `make` returned no optimizer.
-        ValueError: its groups are not those that it was given.
     """
     ends = rate_ends(config, scale)
     parts = {name: [getattr(surfels, name)] for name in PARAMETERS}
@@ -61,8 +55,8 @@ def make_optimizer(
         raise TypeError(f"optimizer: expected it to return a torch.optim.Optimizer, got {type(optimizer).__name__}")
     expected = {name: {id(x) for x in values} for name, values in parts.items()}
     if {g.get("name"): {id(x) for x in g["params"]} for g in optimizer.param_groups} != expected:
-        given = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
-        raise ValueError(f"optimizer: expected it to keep the parameter groups {', '.join(parts)}, got {given}")
+        names = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
+        raise ValueError(f"optimizer: expected it to keep the parameter groups {', '.join(parts)}, got {names}")
     for group in optimizer.param_groups:
         group["ends"] = _scaled_ends(ends[group["name"]], float(group["lr"]))
     if isinstance(optimizer, FusedAdam) and config.max_hits:
@@ -85,12 +79,7 @@ def _scaled_ends(ends: tuple[float, float], rate: float) -> tuple[float, float]:
 
 
 def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
-    """Return the learning rates of a run's first and last step by the name of their group.
-
-    Args:
-        config: whose rates count.
-        scale: of the scene, world units, which the means' rates follow.
-    """
+    """Return the learning rates of a run's first and last step by group; the means' follow the scene's scale."""
     rates = config.rates
     # Adam moves a pose by at most its rate a step: a short run needs longer steps.
     longer = math.sqrt(REFERENCE_ITERATIONS / config.iterations)
@@ -109,14 +98,7 @@ def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
 
 
 def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int, factor: float) -> None:
-    """Set an optimizer's learning rates for a step: log-linear between the ends of each group.
-
-    Args:
-        optimizer: as `make_optimizer` makes it.
-        iteration: of the step, from 1.
-        iterations: of the run.
-        factor: multiplies all rates.
-    """
+    """Set the rates of a step, counted from 1: log-linear between the ends of each group, times a factor."""
     progress = (iteration - 1) / max(iterations - 1, 1)
     for group in optimizer.param_groups:
         first, last = group["ends"]
@@ -126,26 +108,6 @@ def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int,
             group["lr"].fill_(rate)
         else:
             group["lr"] = rate
-
-
-def options_at(
-    config: Config, iteration: int, background: tuple[float, float, float], texture_degree: int
-) -> RenderOptions:
-    """Return how the scene is rendered after an iteration: more hits and SH degrees are unlocked on the way.
-
-    Args:
-        config: settings.
-        iteration: from 0, before the first step.
-        background: of the run.
-        texture_degree: SH degree of the texture.
-    """
-    unlocked = iteration // config.scaled(config.sh_every)
-    return RenderOptions(
-        max_hits=config.hits_at(iteration),
-        background=background,
-        sh_degree=min(max(config.sh_degree, texture_degree), unlocked),
-        order=cast(Order, config.order),
-    )
 
 
 def densify_schedule(config: Config) -> DensifyConfig:

@@ -8,7 +8,7 @@ import torch
 from nexwarp.model.render import Rendering
 from nexwarp.ops import expose
 from nexwarp.train.adam import FusedAdam
-from nexwarp.train.losses import depth_loss, grid_loss, opacity_loss, photo_losses
+from nexwarp.train.losses import depth_loss, grid_loss, photo_losses
 from nexwarp.train.state import TrainingState
 from nexwarp.train.surface_losses import normal_loss
 from nexwarp.train.target import Target
@@ -22,16 +22,9 @@ BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "dept
 
 
 def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]:
-    """Return own losses as a dictionary.
-
-    Raises:
-        TypeError: a name is no text, or a loss is no function.
-        ValueError: a name is that of a built-in loss, or empty.
-    """
+    """Return own losses as a dictionary; ValueError for a name of ours, TypeError for what is no function."""
     for name, loss in (losses or {}).items():
-        if not isinstance(name, str):
-            raise TypeError(f"losses: expected names that are text, got {name!r:.60}")
-        if name in BUILT_IN or not name:
+        if name in BUILT_IN:
             raise ValueError(f"losses: expected names other than {', '.join(BUILT_IN)}, got {name!r}")
         if not callable(loss):
             raise TypeError(f"losses[{name!r}]: expected a function, got {type(loss).__name__}")
@@ -61,14 +54,8 @@ def step_losses(
 ) -> dict[str, torch.Tensor]:
     """Return the terms of a step's loss by name, multiplied by their factors: their sum is the loss.
 
-    Args:
-        out: the rendering of the target's camera, `as_taken`.
-        target: what it is compared with.
-        state: of the training. The grid's term is left out where the optimizer, a `FusedAdam`, computes it.
-        own: losses of one's own, added as they are.
-
-    Raises:
-        TypeError, ValueError: an own loss is no floating scalar tensor on the device.
+    The rendering is that of the target's camera, `as_taken`. The grid's term is left out where the optimizer, a
+    `FusedAdam`, computes it. Losses of one's own are added as they are.
     """
     config, texture, factors = state.config, state.texture, state.config.losses
     losses = photo_losses(
@@ -82,7 +69,7 @@ def step_losses(
         saturation=None if target.exposure is None else SATURATION,
     )
     if factors.opacity > 0:
-        losses["opacity"] = factors.opacity * opacity_loss(state.surfels.opacities)
+        losses["opacity"] = factors.opacity * state.surfels.opacities.mean()
     if config.max_hits > 0 and factors.grid > 0 and not isinstance(state.optimizer, FusedAdam):
         losses["grid"] = factors.grid * grid_loss(texture.grid, texture.resolutions * state.cells_unit)
     if target.empty is not None and factors.empty > 0:
@@ -99,11 +86,11 @@ def step_losses(
 
 
 def _scalar(name: str, value: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """Return the value of an own loss; TypeError or ValueError where it is no floating scalar on the device."""
     if not isinstance(value, torch.Tensor) or not value.is_floating_point():
         kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
         raise TypeError(f"losses[{name!r}]: expected a floating scalar tensor, got {kind}")
-    if value.shape != ():
-        raise ValueError(f"losses[{name!r}]: expected a scalar tensor, got shape {tuple(value.shape)}")
-    if value.device != device:
-        raise ValueError(f"losses[{name!r}]: expected a tensor on {device}, got one on {value.device}")
+    if value.shape != () or value.device != device:
+        got = f"shape {tuple(value.shape)} on {value.device}"
+        raise ValueError(f"losses[{name!r}]: expected a scalar tensor on {device}, got {got}")
     return value

@@ -17,13 +17,9 @@ def normals_factor(config: Config, iteration: int) -> float:
 
 
 def normal_loss(out: Rendering, counts: torch.Tensor | None = None) -> torch.Tensor:
-    """Mean over pixels of sum over hits of weight * (1 - n . N), with N the normal of the depth map.
+    """Mean over pixels of sum over hits of weight * (1 - n . N), with N the normal of the median depths' map.
 
-    The depth map is that of the median depths, from which meshes are made. Pixels whose N is not known do not count.
-
-    Args:
-        out: a rendering.
-        counts: (H, W) bool, the pixels that count; None is all.
+    Pixels whose N is not known do not count, nor those outside of `counts` (H, W) bool.
     """
     stages = out.intermediates
     normals = depth_normals(out.median_depth, stages.viewmat, stages.pinhole)

@@ -68,12 +68,7 @@ class TargetSource:
     """
 
     def __init__(self, state: TrainingState, calibration: ExposureCalibration | None) -> None:
-        """Move the photos to the device.
-
-        Args:
-            state: of the training, whose order of the views it goes through.
-            calibration: exposures of the photos; None where they have one exposure.
-        """
+        """Move the photos, of one exposure where `calibration` is None, to the device."""
         self.state, self.scene, self.config, self.poses = state, state.scene, state.config, state.poses
         gains, lens = (None, None) if calibration is None else (calibration.gains, calibration.exposures)
         self.views = TrainingViews(self.scene.train, state.device, gains, lens)
@@ -95,13 +90,7 @@ class TargetSource:
         return ""
 
     def make(self, index: int, number: int, upcoming: list[int]) -> Target:
-        """Make the target of a step.
-
-        Args:
-            index: of the training view.
-            number: of this view in the training, from 1.
-            upcoming: indices of the views to come, the next one first.
-        """
+        """Make the target of a step with view `index`, number `number` of the training, before the `upcoming` ones."""
         config, iteration = self.config, self.state.iteration
         target = self.with_points(self.from_view(index, upcoming), index)
         target = dataclasses.replace(target, normals=normals_factor(config, iteration))
@@ -114,7 +103,7 @@ class TargetSource:
         return target
 
     def from_view(self, index: int, upcoming: Sequence[int] = ()) -> Target:
-        """Make the target of a view: photo, background and mask; the arguments are those of `make`."""
+        """Make the target of a view: photo, background and mask."""
         camera, photo = self.views.get(index, upcoming)
         background: Color = self.background
         behind = self.background_tensor
@@ -141,9 +130,9 @@ class TargetSource:
             with torch.no_grad():
                 moved = camera if self.poses is None else self.poses.camera(camera, index)
                 seen = moved.project(points.to(device))
-            found = visible_points(*seen, camera.width, camera.height, mask)
+            visible = visible_points(*seen, camera.width, camera.height, mask)
             none = torch.zeros(0, dtype=torch.int64, device=device), torch.zeros(0, device=device)
-            self.points[index] = none if found is None else found
+            self.points[index] = none if visible is None else visible
         places, expected = self.points[index]
         # On CUDA, as many for every view, so that one graph serves all of them. Steps that are not captured pad too:
         # sums of other lengths are rounded differently.

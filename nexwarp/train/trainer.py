@@ -5,37 +5,40 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property, partial, reduce
 from pathlib import Path
+from typing import cast
 
 import torch
 
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene
-from nexwarp.errors import DivergedError, OutOfMemoryError, SceneError
+from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
+from nexwarp.io.files import one_line
+from nexwarp.io.json_files import Json
 from nexwarp.machine import deterministic, needed_memory, seed_everything, torch_threads
 from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, can_capture, graph_key, updating
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.render import draw
+from nexwarp.ops.tiles import Order
+from nexwarp.train.adam import FusedAdam
+from nexwarp.train.checkpoint import Snapshot, load_checkpoint, save_checkpoint
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.finish.finish import FinishObserver, finish_model
-from nexwarp.train.health import Health, go_back, oom_message, watched_tensors
+from nexwarp.train.health import Health, oom_message, watched_tensors
 from nexwarp.train.recipe import Config
 from nexwarp.train.relocation import least_contributing
 from nexwarp.train.report import StepReport
-from nexwarp.train.schedules import OptimizerMaker, options_at, set_rates
-from nexwarp.train.state import (
-    Origin,
-    Snapshot,
-    TrainingState,
-    check_snapshot,
-    checkpoint_errors,
-    scene_digest,
-)
+from nexwarp.train.schedules import OptimizerMaker, set_rates
+from nexwarp.train.state import TrainingState, check_origin, check_snapshot, scene_digest
 from nexwarp.train.step_losses import OwnLoss, as_taken, check_own_losses, step_losses
 from nexwarp.train.target import Target, refined
 from nexwarp.train.teachers import check_teachers, make_targets
 
 CHECK_EVERY = 100  # iterations between checks that all numbers are finite
 SNAPSHOTS = 10  # that a run takes, one replacing the other
+LOWERED_RATES = 0.5  # factor of the rates after a run has gone back
+# What a snapshot that does not fit raises.
+MISFITS = (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError)
 
 
 class Trainer(TrainingState):
@@ -66,9 +69,9 @@ class Trainer(TrainingState):
             scene: what to learn from.
             config: settings.
             device: where to train.
-            losses: own losses by name, added to ours; see `nexwarp.train`.
-            optimizer: makes an optimizer of the parameter groups; None is Adam; see `nexwarp.train`.
-            teachers: trained models of the scene, to learn from their renderings too; see `nexwarp.train`.
+            losses: own losses by name, as for `nexwarp.train`.
+            optimizer: makes an optimizer of the parameter groups; None is Adam.
+            teachers: trained models of the scene, to learn from their renderings too.
             calibrate: estimates the photos' exposures.
 
         Raises:
@@ -123,12 +126,23 @@ class Trainer(TrainingState):
                     if observe is not None:
                         observe(report)
                 except DivergedError as fault:
-                    assert self.good is not None
-                    warn(go_back(self, self.good, fault))
+                    self._go_back(fault, warn)
                 except (MemoryError, RuntimeError) as error:
                     if (needed := needed_memory(error)) is None:
                         raise
                     raise OutOfMemoryError(oom_message(self, needed, graphs=self.graphs is not None)) from error
+
+    def _go_back(self, fault: DivergedError, warn: Callable[[str], None]) -> None:
+        """Return to the last good state with half the learning rates; raise where the run had gone back before."""
+        assert self.good is not None
+        again = self.rate_factor < 1.0
+        self.load_snapshot(self.good)
+        self.rate_factor = LOWERED_RATES
+        if again:
+            raise DivergedError(
+                f"{fault}; it had gone back and halved its learning rates before, so training gives up"
+            ) from None
+        warn(f"{fault}; going back to iteration {self.iteration:,} with half the learning rates")
 
     def _timed_step(self, last: int) -> StepReport:
         """Do a step, count its time, and note its losses for the next check."""
@@ -185,6 +199,13 @@ class Trainer(TrainingState):
             losses |= self.take_grid_loss()
         return StepResult(losses, image, room, gradients)
 
+    def take_grid_loss(self) -> dict[str, torch.Tensor]:
+        """Return the grid's term of the loss, where the optimizer computes it, once after each of its steps."""
+        if not isinstance(self.optimizer, FusedAdam) or self.optimizer.grid_loss is None:
+            return {}
+        loss, self.optimizer.grid_loss = self.optimizer.grid_loss, None
+        return {"grid": loss}
+
     def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
         return loss
 
@@ -216,11 +237,22 @@ class Trainer(TrainingState):
 
     def model(self) -> Model:
         """Return the model as it is now: the trainer's own surfels and texture, at the photos' mean exposure."""
-        return Model(self.surfels, self.texture, options=self.render_options(), meta=self.facts())
+        near, scale = self.scene.train[0].camera.near, self.scene.scale
+        meta: dict[str, Json] = {"near": near, "scene_scale": scale}
+        meta |= {"preset": self.config.preset, "iteration": self.iteration}
+        return Model(self.surfels, self.texture, options=self.render_options(), meta=meta)
 
     def render_options(self) -> RenderOptions:
-        """Return how the scene is rendered at this point of the run."""
-        return options_at(self.config, self.iteration, self.background, self.texture.sh_degree)
+        """Return how the scene is rendered at this point of the run: hits and SH degrees are unlocked on the way."""
+        config = self.config
+        return RenderOptions(
+            max_hits=config.hits_at(self.iteration),
+            background=self.background,
+            sh_degree=min(
+                max(config.sh_degree, self.texture.sh_degree), self.iteration // config.scaled(config.sh_every)
+            ),
+            order=cast(Order, config.order),
+        )
 
     def finish(self, observe: FinishObserver = lambda *_: None) -> Model:
         """Return a finished model of new surfels and the trainer's texture: smooth SH, detail limits, exposures.
@@ -237,7 +269,7 @@ class Trainer(TrainingState):
 
     def check(self) -> None:
         """Raise DivergedError unless all losses since the last check, parameters and optimizer state are finite."""
-        self.health.check(self, self._watched())
+        self.health.check(self.iteration, self._watched())
 
     def _watched(self) -> dict[str, torch.Tensor]:
         return watched_tensors(self._named_parameters(), self.optimizer) | {"densify.errors": self.densifier.errors}
@@ -247,7 +279,7 @@ class Trainer(TrainingState):
         Path(folder).mkdir(parents=True, exist_ok=True)
         self.save_checkpoint(Path(folder))
         self.model().save(folder)
-        self.save_cameras(folder)
+        save_cameras(Path(folder, CAMERAS_FILE), self.scene.cameras)
 
     def save_checkpoint(self, run: Path) -> None:
         """Write a checkpoint into a folder: everything that shapes the future of the run.
@@ -262,10 +294,10 @@ class Trainer(TrainingState):
         self._write(run, self.good)
 
     def _write(self, run: Path, snapshot: Snapshot) -> None:
-        snapshot.save(run)
+        save_checkpoint(run, *snapshot)
 
     def _read(self, run: Path, warn: Callable[[str], None]) -> Snapshot:
-        return Snapshot.load(run, warn)
+        return load_checkpoint(run, warn)
 
     def restore(self, run: Path | str, warn: Callable[[str], None] = lambda _: None, *, extend: bool = False) -> None:
         """Continue from the newest whole checkpoint of the same scene and settings.
@@ -280,25 +312,28 @@ class Trainer(TrainingState):
             ValueError: they are damaged, or scene, settings, optimizer or teachers differ.
         """
         snapshot = self._read(Path(run), warn)
-        with checkpoint_errors(run):
-            self.origin.check(snapshot.state, extend=extend)
+        try:
+            check_origin(self.origin, self.config, snapshot.state, extend=extend)
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
+        except MISFITS as error:
+            reason = one_line(f"it has no {error}" if isinstance(error, KeyError) else str(error))  # torch's are long
+            raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
 
     def snapshot(self) -> Snapshot:
         """Return everything that shapes the future of the run, as copies on the CPU, and where it comes from."""
         tensors, state = super().snapshot()
-        return Snapshot(tensors, state | self.origin.as_dict())
+        return Snapshot(tensors, state | self.origin | {"config": self.config.as_dict()})
 
     def load_snapshot(self, snapshot: Snapshot) -> None:
         """Return to a snapshot of this run, which stays as it is; ValueError or RuntimeError where it does not fit."""
         super().load_snapshot(snapshot)
         if self.graphs is not None:
             self.graphs.clear()
-        self.health = Health(self.iteration)
+        self.health = Health()
 
     @cached_property
-    def origin(self) -> Origin:
-        """What a checkpoint must have in common with this run."""
-        digest = scene_digest(self.scene, self.texture)
-        return Origin(self.config, self.views.fingerprint(), digest, self.targets.digest())
+    def origin(self) -> dict[str, str]:
+        """Digests of what a checkpoint must have in common with this run: views, scene and, with any, teachers."""
+        origin = {"views": self.views.fingerprint(), "scene": scene_digest(self.scene, self.texture)}
+        return origin | ({"teachers": self.targets.digest()} if self.targets.teachers else {})

@@ -23,9 +23,8 @@ VALUES_A_THREAD = 500_000
 class TrainingViews:
     """Training views on the device they are used on; photos stay 8-bit.
 
-    With CUDA, photos are kept on the GPU if they take less than a quarter of its free memory. Otherwise they stay in
-    host memory, and a thread copies the next ones to the GPU while a step runs, through pinned memory and on its own
-    CUDA stream.
+    Where photos take a quarter of the GPU's free memory or more, they stay in host memory, and a thread copies the next
+    ones to the GPU while a step runs, through pinned memory and on its own CUDA stream.
     """
 
     def __init__(
@@ -35,14 +34,7 @@ class TrainingViews:
         gains: torch.Tensor | None = None,
         lens: Exposures | None = None,
     ) -> None:
-        """Move the views to a device.
-
-        Args:
-            views: the training views.
-            device: of the training.
-            gains: (V, 3) gains of the photos; None where they have one exposure.
-            lens: whose falloff the photos have; None is a lens without vignetting.
-        """
+        """Move the views, whose photos have gains (V, 3) and a lens's falloff or else one exposure, to a device."""
         self.device = device
         self.gains = None if gains is None else gains.to(device)
         self.lens = None if lens is None else copy.deepcopy(lens).to(device)
@@ -69,10 +61,7 @@ class TrainingViews:
         return self.cameras if poses is None else poses.cameras(self.cameras)
 
     def torch_threads(self, max_hits: int) -> int:
-        """Return how many threads to give torch's own loops: on a CPU one for each 500,000 values of K hits' colours.
-
-        With a second thread, loops over the demo's images take longer: it has to be woken for each.
-        """
+        """Return how many threads to give torch's own loops: on small images, to wake a second one takes longer."""
         all_threads, camera = torch.get_num_threads(), self.cameras[0]
         if self.device.type != "cpu":
             return all_threads
@@ -87,10 +76,7 @@ class TrainingViews:
         return digest.hexdigest()
 
     def get(self, index: int, ahead: Sequence[int] = ()) -> tuple[Camera, torch.Tensor]:
-        """Return camera and photo (H, W, 3) float in [0, 1] of a view.
-
-        `ahead` are the indices of the next views, in order; up to two of them are copied in the background.
-        """
+        """Return camera and photo (H, W, 3) float in [0, 1] of a view; copy those of the next views, `ahead`."""
         photo = self._on_device(index)
         self._fetch(ahead[:AHEAD])
         return self.cameras[index], photo.float() / 255.0

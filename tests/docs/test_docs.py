@@ -197,7 +197,7 @@ def test_the_options_page_is_that_of_the_code():
 
 
 def test_few_settings_are_for_users():
-    assert set(SYMBOLS) <= set(USER_SETTINGS) <= set(setting_names(Config())) and len(USER_SETTINGS) <= 20
+    assert set(SYMBOLS) <= set(USER_SETTINGS) <= set(setting_names()) and len(USER_SETTINGS) <= 20
 
 
 @pytest.mark.parametrize("name", cli.COMMANDS)
@@ -220,7 +220,7 @@ def test_the_options_page_says_what_help_says(name, capsys, monkeypatch):
 def test_settings_on_the_page_can_be_set():
     """What the tables print is what --set takes: each preset is the other one with the page's values."""
     ours, paper = PRESETS["default"], PRESETS["paper"]
-    values = {name: json.loads(json.dumps(setting(paper, name))) for name in setting_names(paper)}
+    values = {name: json.loads(json.dumps(setting(paper, name))) for name in setting_names()}
     assert with_settings(ours, values) == paper
 
 
@@ -262,7 +262,7 @@ def test_the_paper_page_lists_all_that_differs():
     page = (DOCS / "paper.md").read_text(encoding="utf-8")
     listed = re.findall(r"^\| `([a-z_.]+)` \|", page, re.M)
     ours, paper = preset("default"), preset("paper")
-    differ = {name for name in setting_names(ours) if setting(ours, name) != setting(paper, name)} - {"preset"}
+    differ = {name for name in setting_names() if setting(ours, name) != setting(paper, name)} - {"preset"}
     assert set(listed) == differ and len(listed) == len(differ)
 
 

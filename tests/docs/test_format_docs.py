@@ -18,7 +18,6 @@ from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
-from nexwarp.train.recipe import Config
 from nexwarp.train.settings import setting_names
 from tests.docs.test_docs import DOCS, ROOT
 from tests.exposed import expose_photos
@@ -69,7 +68,7 @@ def flat(data: dict[str, Any], *parts: str) -> set[str]:
 
 def test_files(run):
     listed = named((DOCS / "format.md").read_text(encoding="utf-8").split("\n## ", 1)[0])
-    optional = {"tensorboard/", "camera_path_N.json", "export/", "diverged.json", "wandb.json", "teachers/N/"}
+    optional = {"tensorboard/", "camera_path_N.json", "export/", "wandb.json", "teachers/N/"}
     assert {f.name + "/" * f.is_dir() for f in run.iterdir()} == set(listed) - optional
     assert {f.name for f in (run / "checkpoint").iterdir()} == set(named(section("checkpoint/")))
     assert {f.name for f in (run / "renders").iterdir()} == {"test", "compare"}
@@ -157,7 +156,7 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
 def test_json_files(run):
     config = json.loads((run / "config.json").read_text())
     assert flat(config, "scene") == set(named(section("config.json")))
-    assert flat(config["config"], "losses", "rates", "texture", "densify") == set(setting_names(Config()))
+    assert flat(config["config"], "losses", "rates", "texture", "densify") == set(setting_names())
     cameras = json.loads((run / "cameras.json").read_text())
     assert set(cameras) == {"train", "test"}
     for camera in [*cameras["train"].values(), *cameras["test"].values()]:

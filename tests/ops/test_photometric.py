@@ -10,8 +10,7 @@ from nexwarp.kernels import launch
 from nexwarp.kernels.photometric import WEIGHT_EPSILON
 from nexwarp.ops import photometric
 from nexwarp.ops.photometric import photometric_terms
-from nexwarp.train import losses
-from tests.losses_support import texture_loss
+from tests.losses_support import alpha_loss, l1, texture_loss
 from tests.narrowing import present, total
 from tests.reference import losses as reference
 from tests.tolerances import assert_close
@@ -205,7 +204,7 @@ def test_no_slots(device: torch.device) -> None:
     """With K = 0 alone: nothing is textured, and the whole weight is left."""
     weights = torch.zeros(3, 4, 0, device=device, requires_grad=True)
     picture = torch.rand(3, 4, 3, device=device)
-    assert_close(losses.alpha_loss(weights), torch.ones(()), kind="value", name="alpha")
+    assert_close(alpha_loss(weights), torch.ones(()), kind="value", name="alpha")
     loss = texture_loss(1e-6 * picture, weights, torch.zeros_like(picture))
     assert_close(loss, picture.mean(), kind="value", name="texture")
     assert torch.autograd.grad(loss, weights)[0].shape == (3, 4, 0)
@@ -237,7 +236,7 @@ def test_a_target_that_wants_a_gradient_is_refused() -> None:
     given = inputs()
     target = given["target"].clone().requires_grad_()
     for term in (
-        lambda: losses.l1(given["image"], target),
+        lambda: l1(given["image"], target),
         lambda: texture_loss(given["textured"], given["weights"], target),
     ):
         with pytest.raises(ValueError, match="target: expected a tensor that needs no gradient"):

@@ -12,12 +12,7 @@ from nexwarp.model.model import Model
 
 @torch.no_grad()
 def measure_detail_limits(model: Model, cameras: Iterable[Camera]) -> DetailLimits:
-    """Return the detail limits of a model's surfels: the pixel sizes (depth / focal) at which cameras saw them.
-
-    Args:
-        model: its surfels and options count; K = 0 counts as 1.
-        cameras: of the training views, on any device.
-    """
+    """Return the detail limits of a model's surfels: the pixel sizes (depth / focal) at which cameras saw them."""
     bare = model.bare(max_hits=max(model.options.max_hits, 1))
     surfels = bare.surfels
     nearest = surfels.means.new_full((len(surfels),), NEVER)
@@ -30,9 +25,10 @@ def measure_detail_limits(model: Model, cameras: Iterable[Camera]) -> DetailLimi
         seen, ids = out.weights >= ALPHA_MIN, out.ids.clamp_min(0).long()
         centres = camera.project(surfels.means)[1]
         front = torch.maximum(front, centres.where(centres > camera.near, 0.0) / camera.focal)
-        hits = (out.depths, torch.maximum(out.depths, centres[ids]))
-        for found, depths, none, how in ((nearest, hits[0], NEVER, "amin"), (farthest, hits[1], 0.0, "amax")):
-            found.scatter_reduce_(0, ids.flatten(), (depths / camera.focal).where(seen, none).flatten(), how)
+        near = (out.depths / camera.focal).where(seen, NEVER)
+        far = (torch.maximum(out.depths, centres[ids]) / camera.focal).where(seen, 0.0)
+        nearest.scatter_reduce_(0, ids.flatten(), near.flatten(), "amin")
+        farthest.scatter_reduce_(0, ids.flatten(), far.flatten(), "amax")
     # Surfels without a visible texture have the limit of their centres in the views that they are in front of.
     farthest = farthest.where(farthest > 0, front)
     return DetailLimits(nearest, farthest.where(farthest > 0, NEVER))

@@ -31,15 +31,9 @@ def finish_model(
 ) -> Model:
     """Return a finished model with surfels of its own: smooth SH, detail limits and exposures.
 
-    The surfels are ordered by their share of the training pictures, largest first. The texture is shared.
-
-    Args:
-        model: the trained surfels and texture, at the photos' mean exposure; stays as it is.
-        views: all training views.
-        cameras: of these views, as the poses are corrected, on the model's device.
-        exposures: of the training photos; None where they have one exposure.
-        config: settings of the training.
-        observe: called with each stage's name, how many views of it are rendered, and of how many.
+    The surfels are ordered by their share of the training pictures, largest first. The texture is shared. `cameras`
+    are those of the training views as their poses are corrected, on the model's device. `observe` is called with each
+    stage's name, how many views of it are rendered, and of how many.
     """
     raw = {name: value.detach().clone() for name, value in model.surfels.state_dict().items()}
     finished = Model(Surfels(raw), model.texture, options=model.options)

@@ -13,14 +13,7 @@ HEIGHT = 540  # pixels of the pictures that shares are measured in, at most
 
 @torch.no_grad()
 def picture_shares(model: Model, cameras: Iterable[Camera]) -> torch.Tensor:
-    """Return the sums (N,) of each surfel's blending weights over the pixels of all cameras' pictures.
-
-    A picture counts with its mean over the pixels, so that all count alike.
-
-    Args:
-        model: its surfels and options count.
-        cameras: of the training views, on any device.
-    """
+    """Return the sums (N,) of each surfel's blending weights over all pictures, each by its mean over the pixels."""
     bare = model.bare()
     shares = torch.zeros_like(model.surfels.logit_opacities)
     for camera in cameras:

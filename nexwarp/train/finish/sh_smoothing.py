@@ -28,17 +28,10 @@ LEAST = 1e-6  # least sum of weights over all views, in pixels, of a surfel that
 def smooth_sh(
     model: Model, views: Sequence[View], strength: float, progress: Callable[[int, int], object] = lambda _, __: None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return smoothed coefficients `sh0` (N, 1, 3) and `shN` (N, C - 1, 3).
+    """Return smoothed coefficients `sh0` (N, 1, 3) and `shN` (N, C - 1, 3); masked pixels do not count.
 
     A surfel that no view shows gets one colour for all directions, that of its `sh0`. Coefficients above the rendered
-    degree do not change.
-
-    Args:
-        model: its N surfels and options are used; it does not change.
-        views: all training views, on any device; masked pixels do not count.
-        strength: factor of the smoothness term, `MIN_STRENGTH` to `MAX_STRENGTH`; the data term has factor 1.
-        progress: called after each view that was rendered, with their number and how many there will be: each view
-            once for every group of surfels whose equations are held at once.
+    degree do not change. Each view is rendered once for every group of surfels whose equations are held at once.
     """
     surfels = model.surfels
     sh0, shN = surfels.sh0.detach(), surfels.shN.detach()
@@ -46,7 +39,7 @@ def smooth_sh(
     if count == 1 or not len(surfels):
         return sh0.clone(), shN.clone()
     every = torch.cat([sh0, shN], dim=1)
-    found = every[:, :count]
+    rendered = every[:, :count]
     turns = torch.arange(len(surfels), device=surfels.device).split(PRODUCTS // (count * (count + 1) // 2))
     for turn, ids in enumerate(turns):
 
@@ -56,8 +49,8 @@ def smooth_sh(
         products, total = seen_directions(model, views, ids, done)
         for part in torch.arange(len(ids), device=surfels.device).split(SOLVED // count**2):
             known = total[part] > LEAST
-            _smooth(found, ids[part[known]], products[part[known]] / total[part[known], None], strength)
-            found[ids[part[~known]], 1:] = 0.0
+            _smooth(rendered, ids[part[known]], products[part[known]] / total[part[known], None], strength)
+            rendered[ids[part[~known]], 1:] = 0.0
     return every[:, :1].contiguous(), every[:, 1:].contiguous()
 
 
@@ -77,26 +70,15 @@ def _smooth(coefficients: torch.Tensor, ids: torch.Tensor, equations: torch.Tens
 
 @torch.no_grad()
 def seen_directions(
-    model: Model,
-    views: Sequence[View],
-    ids: torch.Tensor | None = None,
-    progress: Callable[[int], object] = lambda _: None,
+    model: Model, views: Sequence[View], ids: torch.Tensor, progress: Callable[[int], object] = lambda _: None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the normal equations of the regression: sum_v w_v Y_i(d_v) Y_j(d_v), (M, P), and sum_v w_v, (M,).
+    """Return the normal equations of the surfels `ids` (M,): sum_v w_v Y_i(d_v) Y_j(d_v), (M, P), and sum_v w_v, (M,).
 
-    Both are float64: the rounding of sums in float32 would exceed the term of a weak smoothing.
-
-    Args:
-        model: its surfels and options are used. With C rendered coefficients per channel there are
-            P = C (C + 1) / 2 pairs i <= j, row by row of a matrix's upper triangle.
-        views: views v, on any device; masked pixels do not count.
-        ids: (M,) int64, surfels on their device; None is all N.
-        progress: called after each view, with its number, counted from 1.
+    Of C coefficients there are P = C (C + 1) / 2 pairs i <= j, row by row of a matrix's upper triangle. Both are
+    float64: the rounding of sums in float32 would exceed the term of a weak smoothing.
     """
     bare = model.bare()
     surfels = bare.surfels
-    if ids is None:
-        ids = torch.arange(len(surfels), device=surfels.device)
     count = _count(model)
     row, column = _pairs(count, surfels.device)
     products = torch.zeros(len(ids), len(row), dtype=torch.float64, device=surfels.device)
