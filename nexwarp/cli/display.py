@@ -25,11 +25,6 @@ from nexwarp.train.report import StepReport
 
 REFRESH_SECONDS = 0.5
 LOG_LINES = 20
-# At the start of a training on a CPU: steps that compile kernels, and steps and seconds that are timed.
-SKIPPED_STEPS = 3
-TIMED_STEPS = 5
-TIMED_SECONDS = 2.0
-LONG_SECONDS = 600.0  # from which a training on a CPU is announced
 
 
 def describe_exposures(model: Model) -> str:
@@ -75,9 +70,6 @@ class TrainingDisplay:
         self.done = done
         self.device = device
         self.start = self.shown = time.perf_counter()
-        self.estimated = device.type != "cpu"
-        self.steps = 0
-        self.timed_from = (done, self.start)
         self.progress = Progress(
             TextColumn(name),
             BarColumn(),
@@ -100,8 +92,6 @@ class TrainingDisplay:
     def __call__(self, step: StepReport) -> None:
         """Show a step; its numbers are fetched from the device only when they are shown."""
         now = time.perf_counter()
-        if not self.estimated:
-            self._estimate(step.iteration, now)
         if self.console.is_terminal:
             due = now - self.shown >= REFRESH_SECONDS
         else:
@@ -111,37 +101,14 @@ class TrainingDisplay:
         self.shown = now
         rate = (step.iteration - self.done) / max(now - self.start, 1e-9)
         text = f"{rate:.1f} it/s  loss {step.loss():.4f}  train {step.psnr():.2f} dB  {step.surfels:,} surfels"
-        text += f"  {memory(self.device)}"
+        if (used := peak_memory(self.device)) is not None:
+            text += f"  {used / 2**30:.1f} GiB{' GPU' if self.device.type == 'cuda' else ''}"
         self.progress.update(self.task, completed=step.iteration, text=text)
         if not self.console.is_terminal:
             seconds_left = (self.total - step.iteration) / max(rate, 1e-9)
             self.console.print(
                 f"iteration {step.iteration:,}/{self.total:,}  {text}  {seconds_left:.0f} s left", soft_wrap=True
             )
-
-    def _estimate(self, iteration: int, now: float) -> None:
-        """Say once, after the first steps of a long training on a CPU, how long it takes."""
-        self.steps += 1
-        if self.steps == SKIPPED_STEPS:
-            self.timed_from = (iteration, now)
-        first, begin = self.timed_from
-        if self.steps < SKIPPED_STEPS + TIMED_STEPS or now - begin < TIMED_SECONDS:
-            return
-        self.estimated = True
-        seconds = (self.total - iteration) * (now - begin) / (iteration - first)
-        if seconds > LONG_SECONDS:
-            self.console.print(
-                f"on this CPU, the training takes about {seconds / 3600:.1f} hours, longer as surfels are added; "
-                "a GPU, a larger --downscale or fewer --iterations are faster",
-                soft_wrap=True,
-                highlight=False,
-            )
-
-
-def memory(device: torch.device) -> str:
-    """Return the peak memory so far as text, see `peak_memory`; "" if it is unknown."""
-    used = peak_memory(device)
-    return "" if used is None else f"{used / 2**30:.1f} GiB{' GPU' if device.type == 'cuda' else ''}"
 
 
 def _bars(console: Console, *last: ProgressColumn) -> Progress:

@@ -1,13 +1,11 @@
 """Test-time pose optimisation: test cameras moved to where their photos fit the rendering best, the model fixed.
 
-The poses of a refined training agree with each other, but those of its test photos are still the given ones, with their
-errors. As in BARF and its followers, the test poses are then fitted to the test photos before they are judged. The
-model never changes, and metrics.json says that it was done: these figures are not those of given test poses.
+The test poses of a refined training are still the given ones, with their errors. As in BARF and its followers, they are
+fitted to the test photos before they are judged; metrics.json says so.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 
 import torch
 
@@ -31,26 +29,27 @@ def fit_poses(
     steps: int = STEPS,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[list[View], dict[str, float]]:
-    """Return views with the poses at which the model's renderings fit their photos best, and what was done.
+    """Return views with the poses at which the model's renderings fit their photos best, and entries for metrics.json.
 
-    Args:
-        model: the model, on the device to render on; its parameters stay as they are.
-        views: the views.
-        steps: gradient steps of each view.
-        progress: called with each view's name after it is fitted.
-
-    Returns:
-        The views, and entries for metrics.json: how the poses were fitted and how far they moved.
+    These say how the poses were fitted and how far they moved. Each view takes `steps` gradient steps; the model is on
+    the device to render on, and stays as it is.
     """
     check_range("steps", steps, 1)
     scale = model.meta.get("scene_scale", 1.0)
     unit = float(scale) if isinstance(scale, (int, float)) else 1.0
     fitted = []
-    with _frozen(model), torch.enable_grad():
-        for view in views:
-            fitted.append(dataclasses.replace(view, camera=_fit(model, view, unit, steps)))
-            if progress is not None:
-                progress(view.name)
+    learned = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    try:
+        for parameter in learned:
+            parameter.requires_grad_(False)
+        with torch.enable_grad():
+            for view in views:
+                fitted.append(dataclasses.replace(view, camera=_fit(model, view, unit, steps)))
+                if progress is not None:
+                    progress(view.name)
+    finally:
+        for parameter in learned:
+            parameter.requires_grad_(True)
     before, after = (torch.stack([view.camera.viewmat for view in group]) for group in (views, fitted))
     angles, shifts = pose_differences(before, after)
     facts: dict[str, float] = {
@@ -111,16 +110,3 @@ def _halved(camera: Camera, photo: torch.Tensor, counts: torch.Tensor) -> Aim:
     K[:2] /= 2
     small = Camera(camera.viewmat, K, camera.width // 2, camera.height // 2, camera.near)
     return small, layers[..., :3].contiguous(), (layers[..., 3] == 1).to(photo)
-
-
-@contextmanager
-def _frozen(model: Model) -> Iterator[None]:
-    """Let no parameter of a model take gradients."""
-    learned = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    try:
-        for parameter in learned:
-            parameter.requires_grad_(False)
-        yield
-    finally:
-        for parameter in learned:
-            parameter.requires_grad_(True)

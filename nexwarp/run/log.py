@@ -28,20 +28,10 @@ WANDB_PROJECT = "nexwarp"  # unless the variable WANDB_PROJECT names one
 
 
 class TrainingLog:
-    """Observer of a training that writes `metrics.jsonl`: one JSON object per line, flushed after each line.
+    """Observer of a training that writes `metrics.jsonl`, whose fields docs/format.md describes, line by line.
 
     A line is written at iteration 1, every `every` iterations after it, and at the last iteration. At other iterations
-    nothing is fetched from the device. The fields of a line:
-
-        iteration, surfels: the number of each;
-        loss, losses: loss of this step's view, and its weighted terms by name;
-        psnr: PSNR of this step's view [dB];
-        iterations_per_second: mean since the previous line, in wall-clock time with checkpoints and pauses;
-        seconds: training time so far, over all sessions of the run;
-        memory_bytes: see `peak_memory`;
-        rates: learning rates by name, as the optimizer has them: that of the means includes the scene's scale.
-
-    Values that are not finite are written as null.
+    nothing is fetched from the device. Values that are not finite are written as null.
     """
 
     def __init__(
@@ -96,11 +86,10 @@ class TrainingLog:
             return
         assert self.file is not None
         line = self._line(step)
-        self.file.write(json.dumps(_finite(line), allow_nan=False) + "\n")
+        self.file.write(json.dumps(line, allow_nan=False) + "\n")
         self.file.flush()
-        scalars = _scalars(line) if self.sinks else {}
         for sink in self.sinks:
-            sink.write(scalars, step.iteration)
+            sink.write(_scalars(line), step.iteration)
 
     def _line(self, step: StepReport) -> dict[str, Json]:
         # One transfer for all terms. It waits for the step, so the clock is read after it.
@@ -110,16 +99,17 @@ class TrainingLog:
         rate = (step.iteration - self.last) / max(now - self.written, 1e-9)
         self.last = step.iteration
         self.written = now
+        groups = self.trainer.optimizer.param_groups
         return {
             "iteration": step.iteration,
-            "loss": sum(terms),
-            "losses": dict(zip(step.losses, terms, strict=True)),
-            "psnr": psnr,
+            "loss": _finite(sum(terms)),
+            "losses": {name: _finite(value) for name, value in zip(step.losses, terms, strict=True)},
+            "psnr": _finite(psnr),
             "surfels": step.surfels,
             "iterations_per_second": rate,
             "seconds": self.trainer.seconds,
             "memory_bytes": peak_memory(self.trainer.device),
-            "rates": learning_rates(self.trainer.optimizer),
+            "rates": {re.sub("^(raw|log|logit)_", "", group["name"]): _finite(float(group["lr"])) for group in groups},
         }
 
 
@@ -134,11 +124,6 @@ def peak_memory(device: torch.device) -> int | None:
         return None
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-
-
-def learning_rates(optimizer: torch.optim.Optimizer) -> dict[str, float]:
-    """Return an optimizer's learning rates by the names of `nexwarp.train.recipe.LearningRates`."""
-    return {re.sub("^(raw|log|logit)_", "", group["name"]): float(group["lr"]) for group in optimizer.param_groups}
 
 
 def _open_log(path: Path) -> TextIO:
@@ -170,11 +155,8 @@ def _iteration(line: bytes) -> float:
     return iteration if type(iteration) is int else math.inf
 
 
-def _finite(value: object) -> object:
-    """Return a JSON value in which None replaces numbers that are not finite."""
-    if isinstance(value, dict):
-        return {name: _finite(x) for name, x in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _scalars(line: Mapping[str, Json]) -> dict[str, float]:
@@ -196,14 +178,14 @@ def check_package(name: str) -> None:
 
 
 class TensorboardSink:
-    """Writes events to a run's folder `tensorboard`."""
+    """Writes events to a run's folder `tensorboard`; events after `iteration`, which are trained again, are hidden."""
 
     def __init__(self, run: Path, iteration: int) -> None:
-        """Continue after an iteration; events of later iterations, which are trained again, are hidden."""
         from torch.utils.tensorboard import SummaryWriter
 
-        purge = iteration + 1 if iteration else None
-        self.writer: SummaryWriter = SummaryWriter(str(run / TENSORBOARD_FOLDER), purge_step=purge)
+        self.writer: SummaryWriter = SummaryWriter(
+            str(run / TENSORBOARD_FOLDER), purge_step=iteration + 1 if iteration else None
+        )
         self.close = self.writer.close
 
     def write(self, scalars: Mapping[str, float], iteration: int) -> None:
@@ -214,19 +196,22 @@ class TensorboardSink:
 
 
 class WandbSink:
-    """Logs to Weights & Biases; a run that is resumed goes on there, by the id in its `wandb.json`.
-
-    The variables of wandb count, such as WANDB_MODE=offline, WANDB_PROJECT and WANDB_DIR.
-    """
+    """Logs to Weights & Biases; a run that is resumed goes on there, by the id in its `wandb.json`."""
 
     def __init__(self, run: Path, config: dict[str, Json]) -> None:
         """Start or continue; SettingError if wandb cannot, for example without a login."""
         import wandb
 
         project = os.environ.get("WANDB_PROJECT", WANDB_PROJECT)
-        name = run.resolve().name
         try:
-            self.run: wandb.Run = wandb.init(project=project, name=name, config=config, id=_id(run), resume="allow")
+            known = read_object(run / WANDB_FILE).get("id")
+        except READ_ERRORS:
+            known = None
+        known = known if isinstance(known, str) else None
+        try:
+            self.run: wandb.Run = wandb.init(
+                project=project, name=run.resolve().name, config=config, id=known, resume="allow"
+            )
             # Iterations that are trained again, after a resumption or a divergence, are logged again.
             self.run.define_metric("*", step_metric="iteration")
         except (wandb.errors.Error, OSError, ValueError) as error:
@@ -237,12 +222,3 @@ class WandbSink:
     def write(self, scalars: Mapping[str, float], iteration: int) -> None:
         """Log values by name."""
         self.run.log({"iteration": iteration, **scalars})
-
-
-def _id(run: Path) -> str | None:
-    """Return the id under which wandb knows a run; None if it does not know it."""
-    try:
-        value = read_object(run / WANDB_FILE).get("id")
-    except (FileNotFoundError, *READ_ERRORS):
-        return None
-    return value if isinstance(value, str) else None

@@ -21,22 +21,13 @@ from nexwarp.train.recipe import Config
 
 @dataclass(frozen=True)
 class OpenedModel:
-    """A run, or a model alone: its file, or a folder with `model.safetensors` and perhaps `cameras.json`.
+    """A run, or a model alone: its file, or a folder with `model.safetensors` and perhaps `cameras.json`."""
 
-    Attributes:
-        path: as the user gave it.
-        folder: where results are written: the run, the model's folder, or a folder named after the model's file, never
-            that of another model.
-        file: the model's file; a run that has not finished has none yet.
-        source: the run's scene; None for a model alone.
-        config: the run's settings; None for a model alone.
-    """
-
-    path: Path
-    folder: Path
-    file: Path
-    source: SceneSource | None
-    config: Config | None
+    path: Path  # as the user gave it
+    folder: Path  # where results are written; never that of another model
+    file: Path  # the model's; a run that has not finished has none yet
+    source: SceneSource | None  # the run's scene
+    config: Config | None  # the run's settings
 
     @property
     def title(self) -> str:
@@ -64,11 +55,6 @@ class OpenedModel:
                 raise
             return ordered(whole, cameras).at_detail(detail)
 
-    @property
-    def near(self) -> float:
-        """Near depth of new cameras, world units."""
-        return near_depth(self.model)
-
     @cached_property
     def cameras(self) -> dict[str, dict[str, Camera]]:
         """Cameras by set and name; none for a model alone without `cameras.json`. MissingError for a run without it."""
@@ -80,7 +66,7 @@ class OpenedModel:
         """Return the cameras that a path is made of; for a model without any, a ring around its surfels."""
         if self.source is not None or any(self.cameras.values()):
             return self.cameras
-        ring = surrounding(self.model.surfels.means, self.near)
+        ring = surrounding(self.model.surfels.means, near_depth(self.model))
         return {"train": {f"around_{index:02d}": camera for index, camera in enumerate(ring)}}
 
 

@@ -25,7 +25,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.ops.tiles import Order
 from nexwarp.run.folder import FILE_PATH, PROJECTIONS, RENDERS_FOLDER, TEST, TRAIN, picture_name
-from nexwarp.run.opened import OpenedModel
+from nexwarp.run.opened import OpenedModel, near_depth
 
 FRAMES = 120
 FPS = 30.0
@@ -81,11 +81,49 @@ class RenderOrder:
 
     def check(self) -> None:
         """Raise SettingError unless the options fit together."""
-        self._check_views()
-        self._check_camera()
+        kinds = (PINHOLE, *PROJECTIONS)
+        checks = [
+            (self.set not in SETS, f"--set: expected test, train or all, got {self.set!r}"),
+            (
+                self.path is not None and self.path not in PATHS and not self.path.lower().endswith(".json"),
+                f"--path: expected {', '.join(PATHS)} or a file ending in .json, got {self.path!r}",
+            ),
+            (
+                self.frames is not None and self.frames < 0,
+                f"--frames: expected at least 0, got {self.frames}",
+            ),
+            (
+                self.frames == 0 and (self.video is not None or self.views is None),
+                "--frames: expected at least 1 for a path or a video, got 0",
+            ),
+            (
+                self.path_name is None and bool(self.frames),
+                "--frames: expected together with --path or --video, got --set alone",
+            ),
+            (self.fps is not None and self.video is None, "--fps: expected together with --video, got no --video"),
+            (self.camera not in kinds, f"--camera: expected {', '.join(kinds)}, got {self.camera!r}"),
+            (not 1 <= self.fov <= 360, f"--fov: expected 1 to 360 degrees, got {self.fov:g}"),
+            (
+                self.fov != 180.0 and self.camera != "fisheye",
+                f"--fov: expected together with --camera fisheye, got --camera {self.camera}",
+            ),
+        ]
+        for option, value, kind in (("exposure", self.exposure, Exposure), ("order", self.order, Order)):
+            known = get_args(kind)
+            checks.append((value not in (None, *known), f"--{option}: expected {' or '.join(known)}, got {value!r}"))
+        for option, asked in (("order", self.order is not None), ("buffers", self.buffers)):
+            message = f"--{option}: expected together with --camera pinhole, got --camera {self.camera}"
+            checks.append((asked and self.camera != PINHOLE, message))
+        for wrong, message in checks:
+            if wrong:
+                raise SettingError(message)
         self._size()
         if self.video is not None:
-            _check_video(self.video, FPS if self.fps is None else self.fps)
+            try:
+                check_video(self.video, FPS if self.fps is None else self.fps)
+            except ValueError as error:
+                option = "--fps" if str(error).startswith("fps: ") else "--video"
+                raise SettingError(f"{option}: {str(error).removeprefix('fps: ')}") from None
 
     @property
     def path_name(self) -> str | None:
@@ -97,40 +135,8 @@ class RenderOrder:
         """The still views to render, if any."""
         return self.set or ("test" if self.path is None and self.video is None else None)
 
-    def _check_views(self) -> None:
-        if self.set not in SETS:
-            raise SettingError(f"--set: expected test, train or all, got {self.set!r}")
-        if self.path is not None and self.path not in PATHS and not self.path.lower().endswith(".json"):
-            raise SettingError(f"--path: expected {', '.join(PATHS)} or a file ending in .json, got {self.path!r}")
-        if self.frames is not None and self.frames < 0:
-            raise SettingError(f"--frames: expected at least 0, got {self.frames}")
-        if self.frames == 0 and (self.video is not None or self.views is None):
-            raise SettingError("--frames: expected at least 1 for a path or a video, got 0")
-        if self.path_name is None and self.frames:
-            raise SettingError("--frames: expected together with --path or --video, got --set alone")
-        if self.fps is not None and self.video is None:
-            raise SettingError("--fps: expected together with --video, got no --video")
-
-    def _check_camera(self) -> None:
-        kinds = (PINHOLE, *PROJECTIONS)
-        if self.camera not in kinds:
-            raise SettingError(f"--camera: expected {', '.join(kinds)}, got {self.camera!r}")
-        if not 1 <= self.fov <= 360:
-            raise SettingError(f"--fov: expected 1 to 360 degrees, got {self.fov:g}")
-        if self.fov != 180.0 and self.camera != "fisheye":
-            raise SettingError(f"--fov: expected together with --camera fisheye, got --camera {self.camera}")
-        for option, value, kind in (("exposure", self.exposure, Exposure), ("order", self.order, Order)):
-            if value not in (None, *get_args(kind)):
-                raise SettingError(f"--{option}: expected {' or '.join(get_args(kind))}, got {value!r}")
-        for option, asked in (("order", self.order is not None), ("buffers", self.buffers)):
-            if asked and self.camera != PINHOLE:
-                raise SettingError(f"--{option}: expected together with --camera pinhole, got --camera {self.camera}")
-
     def prepare(self, opened: OpenedModel) -> "RenderJob":
-        """Choose the cameras and the files; write nothing.
-
-        A model without cameras has no still views, and its paths lead around its surfels.
-        """
+        """Choose the cameras and the files; a model without cameras has no still views."""
         self.check()
         size = self._size()
         cameras = opened.cameras
@@ -162,7 +168,7 @@ class RenderOrder:
             file = Path(name)
             if self.frames is not None:
                 raise SettingError(f"--frames: expected no value with {file}, which sets it, got {self.frames}")
-            near = next((c.near for group in opened.cameras.values() for c in group.values()), opened.near)
+            near = next((c.near for group in opened.cameras.values() for c in group.values()), near_depth(opened.model))
             path = load_camera_path(file, near)
             return renders / FILE_PATH.format(file.stem), path.cameras, path.fps or FPS
         count = FRAMES if self.frames is None else self.frames
@@ -273,14 +279,6 @@ def projected(order: RenderOrder, model: Model, camera: Camera) -> Camera | RayC
         depth = hit.median().item() if len(hit) else float(cast(float, model.meta.get("scene_scale", 1.0)))
         return RayCamera.orthographic(viewmat, *size, depth / camera.focal, near=camera.near)
     return camera
-
-
-def _check_video(path: Path, fps: float) -> None:
-    try:
-        check_video(path, fps)
-    except ValueError as error:
-        option = "--fps" if str(error).startswith("fps: ") else "--video"
-        raise SettingError(f"{option}: {str(error).removeprefix('fps: ')}") from None
 
 
 def _remove_frames(folder: Path, count: int) -> None:

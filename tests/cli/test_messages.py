@@ -7,13 +7,9 @@ import textwrap
 from pathlib import Path
 
 import pytest
-import torch
-from rich.console import Console
 
 import nexwarp
 from nexwarp.cli import main as cli
-from nexwarp.cli.display import TrainingDisplay
-from nexwarp.train.report import StepReport
 
 CLOSED_PIPE = 141
 
@@ -57,18 +53,3 @@ def test_warp_starts_without_a_word(tmp_path: Path) -> None:
     """
     done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-
-
-def test_a_long_training_on_a_cpu_says_once_how_long_it_takes(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now = 0.0
-    monkeypatch.setattr("time.perf_counter", lambda: now)
-    for total, words in ((30_000, ["about 4.2 hours, longer as surfels are added"]), (1000, [])):
-        now = 0.0
-        shown = TrainingDisplay(Console(), total, 0, torch.device("cpu"))
-        for iteration in range(1, 60):
-            now += 0.5
-            shown(StepReport(iteration, 100, {"l1": torch.tensor(0.1)}, torch.zeros(2, 2, 3), torch.ones(2, 2, 3)))
-        out = " ".join(capsys.readouterr().out.split())
-        assert out.count("on this CPU") == len(words) and all(word in out for word in words)

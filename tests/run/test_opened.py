@@ -10,7 +10,7 @@ import nexwarp as nw
 from nexwarp.cameras.paths import surrounding
 from nexwarp.cli import main as cli
 from nexwarp.run.evaluate import evaluate
-from nexwarp.run.opened import open_model
+from nexwarp.run.opened import near_depth, open_model
 from nexwarp.train.trainer import Trainer
 from tests.scene_writers import write_demo
 from tests.scenes import make_surfels, make_texture, random_scene
@@ -68,7 +68,7 @@ def test_a_trainer_saves_what_the_commands_open_and_what_it_restores(demo: Path,
     opened = open_model(folder)
     assert torch.equal(opened.model.surfels.means, trainer.surfels.means)
     assert opened.cameras["test"].keys() == {view.name for view in scene.test}
-    assert opened.near == pytest.approx(scene.train[0].camera.near)
+    assert near_depth(opened.model) == pytest.approx(scene.train[0].camera.near)
     assert cli.main(["render", str(folder), "--set", "test", "--device", "cpu"]) == 0
     assert cli.main(["eval", str(folder), "--scene", str(demo), "--device", "cpu"]) == 0
     again = Trainer(scene, config, "cpu")
