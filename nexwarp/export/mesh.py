@@ -31,19 +31,12 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh with colours.
+    """A triangle mesh with colours."""
 
-    Attributes:
-        vertices: (V, 3) float32, world frame.
-        normals: (V, 3) float32, unit, towards the side that was seen.
-        colors: (V, 3) uint8 sRGB.
-        triangles: (F, 3) int32, counter-clockwise from the side that was seen.
-    """
-
-    vertices: np.ndarray
-    normals: np.ndarray
-    colors: np.ndarray
-    triangles: np.ndarray
+    vertices: np.ndarray  # (V, 3) float32, world frame
+    normals: np.ndarray  # (V, 3) float32, unit, towards the side that was seen
+    colors: np.ndarray  # (V, 3) uint8 sRGB
+    triangles: np.ndarray  # (F, 3) int32, counter-clockwise from the side that was seen
 
 
 @torch.no_grad()
@@ -162,9 +155,7 @@ def _surface(field: DistanceField, observe: Progress) -> Mesh:
 def _bordered(source: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     """Return a block of (B, 16, 16, 16, ...) values with one layer more: the first ones of its neighbours, or 0.
 
-    Args:
-        source: values of all B blocks.
-        neighbors: (8,) the blocks at `CORNERS`, the block itself first; B where there is none.
+    The neighbours (8,) are the blocks at `CORNERS`, the block itself first; B where there is none.
     """
     side = BLOCK_SIDE
     out = np.zeros((side + 1, side + 1, side + 1, *source.shape[4:]), source.dtype)
@@ -199,11 +190,7 @@ def _without_crumbs(mesh: Mesh) -> Mesh:
 
 
 def save_mesh(path: str | os.PathLike[str], mesh: Mesh) -> None:
-    """Write a mesh as binary PLY: x, y, z, nx, ny, nz, red, green, blue, and triangles as vertex_indices.
-
-    Raises:
-        OSError: `path` cannot be written.
-    """
+    """Write a mesh as binary PLY: x, y, z, nx, ny, nz, red, green, blue, and triangles as vertex_indices."""
     values = [*mesh.vertices.T, *mesh.normals.T, *mesh.colors.T]
     names = ("x", "y", "z", "nx", "ny", "nz", "red", "green", "blue")
     vertices = dict(zip(names, values, strict=True))

@@ -23,38 +23,23 @@ WIDTHS = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7)  # candidates of a row of pieces
 
 @dataclass(frozen=True)
 class Pieces:
-    """M Gaussians: whole surfels first, then pieces of split surfels.
+    """M Gaussians: whole surfels first, then pieces of split surfels."""
 
-    Attributes:
-        ids: (M,) int64, indices of the surfels.
-        offsets: (M, 2) offsets of the centres along the surfel's two axes, world units.
-        scales: (M, 2) standard deviations along the two axes, world units.
-        opacities: (M,) opacities.
-        whole: number of whole surfels.
-    """
-
-    ids: torch.Tensor
-    offsets: torch.Tensor
-    scales: torch.Tensor
-    opacities: torch.Tensor
-    whole: int
+    ids: torch.Tensor  # (M,) int64, indices of the surfels
+    offsets: torch.Tensor  # (M, 2) of the centres along the surfel's two axes, world units
+    scales: torch.Tensor  # (M, 2) standard deviations along the two axes, world units
+    opacities: torch.Tensor  # (M,)
+    whole: int  # number of whole surfels
 
 
 @torch.no_grad()
 def split_large(
     means: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor, cameras: Sequence[Camera], max_extent: float
 ) -> Pieces:
-    """Split surfels that are large compared with their distance to the nearest camera. Gamma is taken as 1.
+    """Split surfels of which a scale is above `max_extent` of their distance to a camera. Gamma is taken as 1.
 
-    Args:
-        means: (N, 3) centres, world frame.
-        scales: (N, 2) standard deviations, world units.
-        opacities: (N,) in [0, 1].
-        cameras: cameras to render accurately from; without any, nothing is split.
-        max_extent: largest standard deviation, as a fraction of the distance; > 0, infinity splits nothing.
-
-    Returns:
-        The surfels that are small enough, in order, then the pieces of the others.
+    Takes centres (N, 3), standard deviations (N, 2) and opacities (N,). Returns the surfels that are small enough, in
+    order, then the pieces of the others.
     """
     limit = means.new_full((len(means),), math.inf)
     for camera in cameras:
@@ -89,8 +74,7 @@ def _reach(peak: torch.Tensor) -> torch.Tensor:
 def _grid(across: int, along: int, level: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Fit `across` pieces on either side of the centre along x, `along` along y, to an opacity of `level` / `LEVELS`.
 
-    Returns:
-        Centres (P, 2) and standard deviations (2,), in standard deviations of the surfel, and opacities (P,).
+    Returns centres (P, 2) and standard deviations (2,), in those of the surfel, and opacities (P,).
     """
     peak = torch.tensor(level / LEVELS, dtype=torch.float64)
     reach = float(_reach(peak))
@@ -119,10 +103,7 @@ def _falloff(offsets: torch.Tensor) -> torch.Tensor:
 
 
 def _fitted(grid: torch.Tensor, size: torch.Tensor, peak: torch.Tensor) -> torch.Tensor:
-    """Return the opacities (P,) of pieces whose optical depths add up to the surfel's at each piece's centre.
-
-    Blending adds optical depths -log(1 - alpha).
-    """
+    """Return the opacities (P,) of pieces whose optical depths, -log(1 - alpha), add up to the surfel's."""
     wanted = -torch.log1p(-peak * _falloff(grid))
     falloff = _falloff((grid[:, None] - grid) / size)
     depths = wanted / falloff.sum(1)

@@ -30,14 +30,8 @@ def save_splats_spz(
 ) -> None:
     """Write the Gaussians of `save_splats_ply`, whose arguments these are, as an SPZ file.
 
-    Positions have steps of 1/4096 world units. Gaussians beyond 2,047 world units from the origin, at most 1 %, are
-    left out: the format cannot hold them.
-
-    Raises:
-        SettingError: the package gaussforge, of the extra `splats`, is not installed.
-        FormatError: more than 1 % of the Gaussians are too far away.
-        ValueError: an argument is out of its range.
-        OSError: `path` cannot be written.
+    Positions have steps of 1/4096 world units. Gaussians beyond 2,047 world units from the origin are left out, as the
+    format cannot hold them; FormatError if they are more than 1 %.
     """
     if importlib.util.find_spec("gaussforge") is None:
         raise SettingError("--format spz: needs the package gaussforge, found none; pip install 'nexwarp[splats]'")

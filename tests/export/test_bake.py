@@ -142,11 +142,6 @@ def test_a_gpu_bakes_what_the_cpu_bakes(model, baked, cameras, tmp_path):
     save_glb(tmp_path / "scene.glb", there, views)
 
 
-def test_no_cameras_are_refused(model):
-    with pytest.raises(ValueError, match="cameras: expected at least one"):
-        bake(model, [])
-
-
 def test_the_gltf_file_holds_the_surfels(baked, cameras, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     file = tmp_path / "scene.glb"

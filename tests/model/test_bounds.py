@@ -12,7 +12,6 @@ import torch
 
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
-from nexwarp.export.surfels_ply import load_surfels_ply, save_surfels_ply
 from nexwarp.model.bounds import BOUNDS
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
@@ -193,25 +192,6 @@ def test_a_number_of_the_metadata_is_refused_or_renders_finite(
         return
     assert math.isfinite(value) and abs(value) < 1e30
     check_pictures(model, tiny_camera(), f"{key} = {value}")
-
-
-@pytest.mark.parametrize("name", ["x", "f_dc_1", "f_rest_3", "opacity", "scale_0", "rot_2", "gamma_1"])
-def test_a_number_of_a_surfels_ply_is_refused_or_renders_finite(tmp_path: Path, name: str) -> None:
-    file = tmp_path / "surfels.ply"
-    save_surfels_ply(file, make_surfels(random_scene(12, width=16, height=12)))
-    content = file.read_bytes()
-    start = content.index(b"end_header\n") + len(b"end_header\n")
-    names = [line.split()[-1] for line in content[:start].decode().splitlines() if line.startswith("property")]
-    place = start + 4 * names.index(name)
-    for value in VALUES:
-        file.write_bytes(content[:place] + torch.tensor([value]).numpy().tobytes() + content[place + 4 :])
-        try:
-            surfels = load_surfels_ply(file)
-        except ValueError as error:
-            check_message(error, file, "surfels")
-            continue
-        assert math.isfinite(value), f"{name} with {value} loads"
-        check_pictures(nw.Model(surfels, None), tiny_camera(), f"surfels {name} = {value}")
 
 
 def camera_numbers(entry: dict[str, Any]) -> Iterator[tuple[str, list[Any] | dict[str, Any], Any]]:

@@ -21,7 +21,7 @@ from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.ply import read_ply
 from nexwarp.data.scene import SceneSource
 from nexwarp.data.sfm.photos import MAKE, MODEL, camera_groups, read_photos
-from nexwarp.export.surfels_ply import load_surfels_ply, save_splats_ply, save_surfels_ply
+from nexwarp.export.surfels_ply import save_splats_ply
 from nexwarp.io.json_files import write_json
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.model import Model
@@ -142,12 +142,6 @@ def _ply(folder: Path) -> list[Files]:
     return [*inputs, _files(folder)]
 
 
-def _surfels_ply(folder: Path) -> list[Files]:
-    save_surfels_ply(folder / "a" / "surfels.ply", some_surfels())
-    save_surfels_ply(folder / "b" / "surfels.ply", some_surfels().double())
-    return [_files(folder / "a"), _files(folder / "b")]
-
-
 def _nerfstudio(folder: Path) -> list[Files]:
     cameras = some_cameras()
     inputs = []
@@ -197,10 +191,6 @@ def _model(folder: Path) -> list[Files]:
 
 def _read_model(folder: Path) -> None:
     check_rendering(load(folder))
-
-
-def _read_surfels(folder: Path) -> None:
-    check_rendering(Model(load_surfels_ply(folder / "surfels.ply"), None).float())
 
 
 def _checkpoint(folder: Path) -> list[Files]:
@@ -369,7 +359,6 @@ TARGETS = {
         FuzzTarget("log", _log, _read_log, (".jsonl",)),
         FuzzTarget("camera_path", _camera_path, _read_camera_path, (".json",)),
         FuzzTarget("ply", _ply, lambda folder: read_ply(folder / "points.ply"), (".ply",)),
-        FuzzTarget("surfels_ply", _surfels_ply, _read_surfels, (".ply",)),
         FuzzTarget("masks", _images, _read_images, ("mask",)),
         FuzzTarget("photos", _photo_files, _read_photo_files, (".jpg",)),
         FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),

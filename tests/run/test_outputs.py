@@ -17,7 +17,6 @@ from nexwarp.cameras.nerfstudio import load_camera_path, load_transforms, save_c
 from nexwarp.cameras.paths import ellipse, interpolate, spiral
 from nexwarp.cli import main as cli
 from nexwarp.data.scene import SceneSource
-from nexwarp.export.surfels_ply import load_surfels_ply
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.buffers import load_buffers
 from nexwarp.model.exposures import Exposures
@@ -225,9 +224,6 @@ def test_export_ply(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert command("export", run) == 0
     assert files(run / "export") == {"surfels.ply", "splats.ply"}
     assert capsys.readouterr().out.split() == [str(run / "export" / n) for n in ("surfels.ply", "splats.ply")]
-    after = load_surfels_ply(run / "export" / "surfels.ply").state_dict()
-    for name, x in nw.load(run).surfels.state_dict().items():
-        assert after[name].equal(x), name
     assert command("export", run, "--format", "ply", "--out", tmp_path / "a" / "b") == 0
     assert files(tmp_path / "a" / "b") == {"surfels.ply", "splats.ply"}
 

@@ -14,21 +14,13 @@ from nexwarp.model.surfels import Surfels
 
 @dataclass(frozen=True)
 class Baked:
-    """Surfels whose colour at a point is their plain colour plus a texel of the atlas, for all hits of a pixel.
+    """Surfels whose colour at a point is their plain colour plus a texel of the atlas, for all hits of a pixel."""
 
-    Attributes:
-        model: the model that was baked.
-        surfels: its surfels, with SH that take over the texture's dependence on the direction.
-        seen: what the views see of the surfels.
-        layout: the surfels' texels in the atlas.
-        atlas: (height, width, 3) float32, added to the plain colours, sRGB.
-    """
-
-    model: Model
-    surfels: Surfels
-    seen: Observations
-    layout: Layout
-    atlas: torch.Tensor
+    model: Model  # that was baked
+    surfels: Surfels  # its surfels, with SH that take over the texture's dependence on the direction
+    seen: Observations  # what the views see of the surfels
+    layout: Layout  # the surfels' texels in the atlas
+    atlas: torch.Tensor  # (height, width, 3) float32, added to the plain colours, sRGB
 
     @torch.no_grad()
     def render(self, camera: Camera) -> torch.Tensor:

@@ -20,27 +20,13 @@ RATES = {"atlas": 0.02, "sh0": 5e-3, "shN": 2e-3}
 LAST_RATE = 0.1  # relative to the first
 
 
-def bake(
-    model: Model,
-    cameras: Sequence[Camera],
-    *,
-    texel: float = 1.0,
-    side: int = 4096,
-    steps: int | None = None,
-) -> Baked:
-    """Bake a model's texture into an atlas.
+def bake(model: Model, cameras: Sequence[Camera], *, steps: int | None = None) -> Baked:
+    """Bake a model's texture into an atlas whose texels are about a pixel of the closest of the given views.
 
-    Args:
-        model: the model.
-        cameras: the views that the baked scene shall look like the model in, at least one.
-        texel: size of a texel in pixels of the closest view.
-        side: largest width and height of the atlas.
-        steps: steps of the fit; None derives them from the number of the views' pixels.
+    The number of steps of the fit follows from that of the views' pixels unless it is given.
     """
-    if not cameras:
-        raise ValueError("cameras: expected at least one, got none")
     seen = observe(model, cameras)
-    layout = lay_out(seen.boxes, seen.boxes[:, 2] > seen.boxes[:, 0], seen.pixels, texel=texel, side=side)
+    layout = lay_out(seen.boxes, seen.boxes[:, 2] > seen.boxes[:, 0], seen.pixels)
     atlas = evaluate(model, seen, layout)
     if steps is None:
         windows = sum(camera.width * camera.height for camera in cameras) / WINDOW**2

@@ -4,12 +4,13 @@ import importlib.util
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any
 
 import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.paths import camera_poses
 from nexwarp.errors import FormatError, SettingError
 from nexwarp.export.bake.baked import Baked, mean_colors
 from nexwarp.export.bake.layout import Layout, lay_out
@@ -26,29 +27,19 @@ FEWEST = 8  # texels along an axis: alpha varies over every quad
 
 
 @torch.no_grad()
-def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camera], side: int = 4096) -> None:
+def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camera]) -> None:
     """Write a baked scene as a glTF 2.0 binary file, atomically: unlit quads with one texture of colours and alpha.
 
     Colours are those at the mean exposure from the direction in which the views see each surfel. The mean of the
-    cameras' upward directions becomes +y.
-
-    Args:
-        path: file to write.
-        baked: the scene.
-        cameras: cameras of its views.
-        side: largest width and height of the texture.
-
-    Raises:
-        SettingError: trimesh, of the extra `glb`, is not installed.
-        FormatError: no surfel is opaque enough to be seen.
-        OSError: `path` cannot be written.
+    cameras' upward directions becomes +y. SettingError: trimesh, of the extra `glb`, is not installed. FormatError: no
+    surfel is opaque enough to be seen.
     """
     check_package()
     import trimesh
     from PIL import Image
     from trimesh.exchange.gltf import export_glb
 
-    layout, pixels = _texture(baked, side)
+    layout, pixels = _texture(baked)
     if not len(layout.textured()):
         raise FormatError(f"{path}: expected surfels with an opacity above {CUTOFF}, which glTF shows; found none")
     corners, places, faces = _quads(baked, layout)
@@ -69,8 +60,7 @@ def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camer
         ),
         process=False,
     )
-    content = export_glb(trimesh.Scene(mesh), tree_postprocessor=_unlit)
-    write_atomically(Path(path), content)
+    write_atomically(Path(path), export_glb(trimesh.Scene(mesh), tree_postprocessor=_unlit))
 
 
 def check_package() -> None:
@@ -81,15 +71,14 @@ def check_package() -> None:
 
 def upright(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the rotation (3, 3) of the world that turns the mean of the cameras' upward directions to +y."""
-    ups = [-camera.viewmat[1, :3].detach().double().cpu().numpy() for camera in cameras]
-    up = np.sum(ups, axis=0) if ups else np.array([0.0, -1.0, 0.0])
+    up = -camera_poses(cameras)[0][:, 1, :3].mean(0).numpy()
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, -1.0, 0.0])
     side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     side /= np.linalg.norm(side)
     return np.stack([side, up, np.cross(side, up)])
 
 
-def _texture(baked: Baked, side: int) -> tuple[Layout, np.ndarray]:
+def _texture(baked: Baked) -> tuple[Layout, np.ndarray]:
     """Return a layout of the surfels' visible parts, and its texels (height, width, 4) uint8, RGBA."""
     surfels = baked.surfels
     opacities, gammas = surfels.opacities.clamp(max=ALPHA_MAX), surfels.gammas
@@ -97,7 +86,7 @@ def _texture(baked: Baked, side: int) -> tuple[Layout, np.ndarray]:
     # |u|^(2 gamma) = 2 log(opacity / alpha) at the end of the quad.
     reach = (2 * (opacities / LEAST_ALPHA).clamp_min(1).log())[:, None].pow(0.5 / gammas)
     boxes = torch.cat([-reach, reach], dim=1)
-    layout = lay_out(boxes, visible, baked.seen.pixels, texel=1.0, side=side, fewest=FEWEST)
+    layout = lay_out(boxes, visible, baked.seen.pixels, fewest=FEWEST)
     places, ids, local = layout.centres()
     plain = mean_colors(surfels, baked.seen, baked.model.options.sh_degree)
     colors = plain[ids] + baked.added(ids, local)
@@ -128,11 +117,11 @@ def _quads(baked: Baked, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.nda
     return corners.reshape(-1, 3).double().cpu().numpy(), places.reshape(-1, 2).cpu().numpy(), faces
 
 
-def _unlit(tree: dict[str, list[object]]) -> None:
+def _unlit(tree: dict[str, Any]) -> None:
     """Make the material show its texture as it is, without light and without coarser levels of the texture."""
     for material in tree["materials"]:
-        cast("dict[str, object]", material)["extensions"] = {"KHR_materials_unlit": {}}
+        material["extensions"] = {"KHR_materials_unlit": {}}
     tree["extensionsUsed"] = ["KHR_materials_unlit"]
     tree["samplers"] = [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]
     for texture in tree["textures"]:
-        cast("dict[str, object]", texture)["sampler"] = 0
+        texture["sampler"] = 0

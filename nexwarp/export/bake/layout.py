@@ -18,16 +18,10 @@ class Layout:
 
     The centres of a rectangle's outer texels lie on the sides of the surfel's box. Beyond its box a surfel has the
     colours of the box's side: samplers clamp the coordinates, and bilinear sampling never reads a neighbour's texel.
-
-    Attributes:
-        rects: (N, 4) int32 left, top, width, height, texels; the one texel at (0, 0) for surfels without a texture.
-        boxes: (N, 4) u0, v0, u1, v1, in units of the scales; 0, 0, 0, 0 for surfels without a texture.
-        width: of the atlas.
-        height: of the atlas.
     """
 
-    rects: torch.Tensor
-    boxes: torch.Tensor
+    rects: torch.Tensor  # (N, 4) int32 left, top, width, height; the one texel at (0, 0) for surfels without a texture
+    boxes: torch.Tensor  # (N, 4) u0, v0, u1, v1, in units of the scales; 0, 0, 0, 0 for surfels without a texture
     width: int
     height: int
 
@@ -36,11 +30,9 @@ class Layout:
         return (self.boxes[:, 2] > self.boxes[:, 0]).nonzero()[:, 0]
 
     def texels(self, ids: torch.Tensor, local: torch.Tensor) -> torch.Tensor:
-        """Return places (..., 2) in the atlas, column and row; whole numbers are centres of texels.
+        """Return places (..., 2) in the atlas, column and row, of coordinates (..., 2) on surfels (...).
 
-        Args:
-            ids: (...) surfels, int64.
-            local: (..., 2) coordinates on them, in units of the scales.
+        Whole numbers are centres of texels; the coordinates are in units of the scales.
         """
         boxes, rects = self.boxes[ids], self.rects[ids].to(local)
         share = (local - boxes[..., :2]) / (boxes[..., 2:] - boxes[..., :2]).clamp_min(1e-12)
@@ -60,17 +52,18 @@ class Layout:
 
 
 def lay_out(
-    boxes: torch.Tensor, textured: torch.Tensor, pixels: torch.Tensor, *, texel: float, side: int, fewest: int = 2
+    boxes: torch.Tensor,
+    textured: torch.Tensor,
+    pixels: torch.Tensor,
+    *,
+    texel: float = 1.0,
+    side: int = 4096,
+    fewest: int = 2,
 ) -> Layout:
-    """Give each textured surfel a rectangle for its box.
+    """Give each textured surfel (N,) a rectangle for its box (N, 4), in units of the scales.
 
-    Args:
-        boxes: (N, 4) u0, v0, u1, v1, in units of the scales.
-        textured: (N,) bool.
-        pixels: (N, 2) number of pixels that one scale covers along either axis.
-        texel: size of a texel in pixels; it grows until the atlas holds all of them.
-        side: largest width and height of the atlas, texels.
-        fewest: smallest number of texels along an axis of a surfel, where the atlas has room for it.
+    One scale covers `pixels` (N, 2) along either axis. `texel`, the size of a texel in pixels, grows until the atlas of
+    at most `side` texels a side holds all of them. A surfel has `fewest` texels along an axis where there is room.
     """
     boxes = boxes.where(textured[:, None], 0.0)
     covered = ((boxes[:, 2:] - boxes[:, :2]) * pixels)[textured].double().cpu()
@@ -111,8 +104,7 @@ def _area(sizes: torch.Tensor) -> int:
 def _pack(sizes: torch.Tensor, width: int) -> tuple[torch.Tensor, int]:
     """Place rectangles (M, 2) on shelves, tallest first, below a first row that holds the texel of untextured surfels.
 
-    Returns:
-        Left and top (M, 2) int32, and the height of the atlas, a multiple of 4.
+    Returns left and top (M, 2) int32, and the height of the atlas, a multiple of 4.
     """
     order = torch.argsort(sizes[:, 1], descending=True, stable=True)
     places: list[tuple[int, int]] = []

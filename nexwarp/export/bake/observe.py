@@ -19,25 +19,15 @@ TINY_WEIGHT = 1e-3  # hits below it keep their plain colours
 
 @dataclass(frozen=True)
 class ViewHits:
-    """The heaviest hits of each pixel of one view, at most 8 a pixel; P hits in all.
+    """The heaviest hits of each pixel of one view, at most 8 a pixel; P hits in all."""
 
-    Attributes:
-        rendering: the rendering without texture.
-        pixels: (P,) int64, indices of the hits' pixels, row-major.
-        ranks: (P,) int64, their ranks in the pixel; 0 has the largest weight.
-        ids: (P,) int64, surfels.
-        weights: (P,) blending weights.
-        local: (P, 2) coordinates of the hits on their surfels, in units of the scales.
-        directions: (P, 3) unit directions of the rays, world frame.
-    """
-
-    rendering: Rendering
-    pixels: torch.Tensor
-    ranks: torch.Tensor
-    ids: torch.Tensor
-    weights: torch.Tensor
-    local: torch.Tensor
-    directions: torch.Tensor
+    rendering: Rendering  # without texture
+    pixels: torch.Tensor  # (P,) int64, indices of the hits' pixels, row-major
+    ranks: torch.Tensor  # (P,) int64, in the pixel; 0 has the largest weight
+    ids: torch.Tensor  # (P,) int64, surfels
+    weights: torch.Tensor  # (P,) blending weights
+    local: torch.Tensor  # (P, 2) coordinates of the hits on their surfels, in units of the scales
+    directions: torch.Tensor  # (P, 3) unit directions of the rays, world frame
 
     def plain_colors(self) -> torch.Tensor:
         """Return the hits' plain colours (P, 3)."""
@@ -52,21 +42,13 @@ class ViewHits:
 
 @dataclass(frozen=True)
 class Observations:
-    """What a set of views sees of N surfels.
+    """What a set of views sees of N surfels."""
 
-    Attributes:
-        boxes: (N, 4) u0, v0, u1, v1: the box, in units of the scales, that holds all textured hits of some weight;
-            u0 > u1 for surfels without any.
-        pixels: (N, 2) largest number of pixels that one scale covers along the surfel's x and y axes.
-        textured: (N,) fraction of the surfel's blending weight that is textured.
-        directions: (N, 3) mean direction from which the surfel is seen, unit, world frame; 0 for surfels that no view
-            sees.
-    """
-
+    # (N, 4) u0, v0, u1, v1, in units of the scales: the box of all textured hits of some weight; u0 > u1 without any
     boxes: torch.Tensor
-    pixels: torch.Tensor
-    textured: torch.Tensor
-    directions: torch.Tensor
+    pixels: torch.Tensor  # (N, 2) largest number of pixels that one scale covers along the surfel's x and y axes
+    textured: torch.Tensor  # (N,) fraction of the surfel's blending weight that is textured
+    directions: torch.Tensor  # (N, 3) mean direction from which it is seen, unit, world frame; 0 if no view sees it
 
 
 def axes(surfels: Surfels) -> tuple[torch.Tensor, torch.Tensor]:

@@ -21,15 +21,7 @@ LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
 def bake(model: Model, cameras: Mapping[str, Camera]) -> dict[str, bytes]:
-    """Bake a model for the page.
-
-    Args:
-        model: the model.
-        cameras: cameras of the run by name; without any, nothing is baked.
-
-    Returns:
-        Content by file name: `baked.nxb` and `atlas.webp`; empty without cameras.
-    """
+    """Bake a model for the page; return the content of its files by name, none without cameras."""
     if not cameras or not len(model.surfels):
         return {}
     return encode_baked(bake_model(model, list(cameras.values())), cameras)
@@ -66,12 +58,9 @@ def encode_baked(baked: Baked, cameras: Mapping[str, Camera]) -> dict[str, bytes
 
 
 def encode_harmonics(surfels: Surfels) -> tuple[np.ndarray, list[float]]:
-    """Quantise the SH coefficients above degree 0.
+    """Quantise the SH coefficients above degree 0 to (N, C - 1, 3) uint8 codes, and the ranges of degrees 1, 2, 3.
 
     A code c is the value sign(c - 128) ((c - 128) / 127)^2 range: small values, which are most, have fine steps.
-
-    Returns:
-        (N, C - 1, 3) uint8 codes, and the ranges of degrees 1, 2, 3.
     """
     values = array_of(surfels.shN)
     codes, ranges = np.full(values.shape, 128, np.uint8), []

@@ -15,7 +15,7 @@ from nexwarp.cameras.camera import Camera, resized
 from nexwarp.errors import FormatError
 from nexwarp.export.web.atlas import bake
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
-from nexwarp.io.files import written_aside
+from nexwarp.io.files import write_atomically
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.model import Model
 
@@ -30,29 +30,16 @@ POSTER_QUALITY = 75
 def export_web(
     model: Model, cameras: Mapping[str, Camera], out: Path, *, quality: str = "quantised", title: str = "nexwarp"
 ) -> list[Path]:
-    """Write the page of a scene.
+    """Write the page of a scene, and return its files; it starts at the first of the cameras by name.
 
-    Args:
-        model: the scene.
-        cameras: cameras by name; the first is where the page starts.
-        out: a file name that ends in .html, or a folder, created if it does not exist.
-        quality: "quantised" or "full", of the scene file.
-        title: of the page.
-
-    Returns:
-        The files that were written.
-
-    Raises:
-        ValueError, OSError: the message names the option or file; existing files stay unchanged.
+    `out` is a file name that ends in .html, or a folder; `quality` of the scene file is "quantised" or "full".
     """
     content = page_files(model, cameras, quality=quality, title=title)
     if out.suffix == ".html":
         content = {out.name: one_file(content)}
         out = out.parent
     for name, data in content.items():
-        (out / name).parent.mkdir(parents=True, exist_ok=True)
-        with written_aside(out / name) as aside:
-            aside.write_bytes(data)
+        write_atomically(out / name, data)
     return [out / name for name in content]
 
 

@@ -60,8 +60,7 @@ def morton_order(means: np.ndarray) -> np.ndarray:
 def encode_chunks(values: np.ndarray, dtype: type, size: int = CHUNK) -> tuple[np.ndarray, np.ndarray]:
     """Quantise (N, C) values, each column of each chunk of `size` rows with a range of its own.
 
-    Returns:
-        (N, C) codes, and (chunks, C, 2) float32: value of code 0 and difference between codes.
+    Returns (N, C) codes, and (chunks, C, 2) float32: value of code 0 and difference between codes.
     """
     if len(values) == 0:
         return np.zeros(values.shape, dtype), np.zeros((0, values.shape[1], 2), np.float32)
@@ -94,8 +93,7 @@ def encode_quats(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     A surfel looks the same after half turns about its axes, and after a quarter turn about z that swaps its axes. So
     w can be the largest component, and |z| at most sin(22.5 degrees): fewer values, finer steps.
 
-    Returns:
-        (N,) uint32 codes of x, y (11 bits each) and z (10 bits); and (N,) bool: whether the axes were swapped.
+    Returns (N,) uint32 codes of x, y (11 bits each) and z (10 bits); and (N,) bool: whether the axes were swapped.
     """
     w, x, y, z = straight = quats.astype(np.float64).T
     quarter = np.sqrt(0.5) * np.array([w - z, x + y, y - x, z + w])
@@ -123,8 +121,7 @@ def log_of(values: np.ndarray) -> np.ndarray:
 def encode_limits(limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Quantise detail limits (N, 2) logarithmically.
 
-    Returns:
-        (N, 2) uint16 codes, 0 for 0 and 65535 for NEVER; and (2,) float32, logarithm of code 1 and step of the others.
+    Returns (N, 2) uint16 codes, 0 for 0 and 65535 for NEVER; and (2,) float32, logarithm of code 1 and step of others.
     """
     known = (limits > 0) & (limits < NEVER)
     logs = log_of(limits)
@@ -135,14 +132,7 @@ def encode_limits(limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def encode_levels(grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quantise a hash grid (L, T, F), a range for each level.
-
-    Returns:
-        (L, T, F) uint8 codes, and (L, 2) float32: value of code 0 and difference between codes.
-    """
-    flat = grid.reshape(len(grid), -1).astype(np.float64)
-    low = flat.min(1)
-    ranges = np.stack([low, (flat.max(1) - low) / 255], 1).astype(np.float32)
-    steps = np.where(ranges[:, 1:] > 0, ranges[:, 1:], 1.0)
-    codes = np.clip(np.rint((flat - ranges[:, :1]) / steps), 0, 255)
-    return codes.astype(np.uint8).reshape(grid.shape), ranges
+    """Quantise a hash grid (L, T, F) to codes and (L, 2) ranges, one for each level."""
+    levels = [encode_chunks(level.astype(np.float64).reshape(-1, 1), np.uint8, level.size) for level in grid]
+    codes = np.stack([codes for codes, _ in levels]).reshape(grid.shape)
+    return codes, np.concatenate([ranges[:, 0] for _, ranges in levels])

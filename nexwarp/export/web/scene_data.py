@@ -16,41 +16,25 @@ LARGEST_SURFELS = 2**24
 
 @dataclass(frozen=True)
 class SceneData:
-    """A scene, activated: N surfels, float32, and what a rendering needs beside them.
+    """A scene, activated: N surfels, float32, and what a rendering needs beside them."""
 
-    Attributes:
-        means: (N, 3) world units.
-        quats: (N, 4) unit, wxyz, surfel to world.
-        scales: (N, 2) world units.
-        opacities: (N,).
-        gammas: (N, 2).
-        limits: (N, 2) detail limits, nearest and farthest; None limits nothing.
-        sh: (N, C, 3) coefficients of the plain colour.
-        options: options of the rendering.
-        texture: the neural texture; None for a scene without.
-        exposures: of V photos, see `Exposures`: "poses" (V, 9), position, direction and coefficients of each; "mean"
-            (3,), "lengths" (2,), "falloff" (3,); "lowest" and "highest" (3,), the extreme log gains; None without.
-    """
-
-    means: np.ndarray
-    quats: np.ndarray
-    scales: np.ndarray
-    opacities: np.ndarray
-    gammas: np.ndarray
-    limits: np.ndarray | None
-    sh: np.ndarray
+    means: np.ndarray  # (N, 3) world units
+    quats: np.ndarray  # (N, 4) unit, wxyz, surfel to world
+    scales: np.ndarray  # (N, 2) world units
+    opacities: np.ndarray  # (N,)
+    gammas: np.ndarray  # (N, 2)
+    limits: np.ndarray | None  # (N, 2) detail limits, nearest and farthest; None limits nothing
+    sh: np.ndarray  # (N, C, 3) coefficients of the plain colour
     options: RenderOptions
     texture: NeuralTexture | None
+    # Of V photos, see `Exposures`: "poses" (V, 9), position, direction and coefficients of each; "mean" (3,), "lengths"
+    # (2,), "falloff" (3,); "lowest" and "highest" (3,), the extreme log gains.
     exposures: dict[str, np.ndarray] | None
 
     @classmethod
     @torch.no_grad()
     def of(cls, model: Model) -> "SceneData":
-        """Take the values of a model.
-
-        Raises:
-            FormatError: the model has more surfels than a scene file may have, or blends them by distance.
-        """
+        """Take the values of a model; FormatError: it has too many surfels for a file, or blends them by distance."""
         surfels, options = model.surfels, model.options
         if len(surfels) > LARGEST_SURFELS:
             raise FormatError(f"model: expected at most {LARGEST_SURFELS:,} surfels, got {len(surfels):,}")

@@ -32,17 +32,9 @@ def encode_scene(
     title: str = "",
     poster: bytes | None = None,
 ) -> bytes:
-    """Return the content of a scene file.
+    """Return the content of a scene file of a quality, with cameras by name; of more than 200, every n-th is kept.
 
-    Args:
-        model: the scene.
-        cameras: cameras by name; of more than 200, every n-th is kept.
-        quality: "quantised" or "full".
-        title: of the page.
-        poster: a JPEG picture that is shown until the scene is loaded; None shows none.
-
-    Raises:
-        ValueError: the message names the argument.
+    `poster` is a JPEG picture that is shown until the scene is loaded.
     """
     if quality not in QUALITIES:
         raise SettingError(f"--quality: expected {' or '.join(QUALITIES)}, got {quality!r:.60}")
