@@ -6,7 +6,7 @@ the mean exposure and without vignetting. A rendering is multiplied by the gains
 predict, and by the falloff of the lens.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import nn
@@ -23,7 +23,15 @@ EVEN = (0.0, 0.0, 1.0)  # the falloff of a lens without vignetting
 LENGTHS = (0.4, 0.8, 1.6, 3.2, 6.4)  # candidates of the kernel's length, relative to the spread of the cameras
 NOISES = (1e-3, 1e-2, 1e-1)  # candidates of the noise variance, relative to that of the process
 MOST_FALLOFFS = 16  # largest number of falloff images that are cached
-BUFFERS = ("log_gains", "positions", "directions", "coefficients", "mean", "lengths", "falloff")
+SHAPES = {
+    "log_gains": ("V", 3),
+    "positions": ("V", 3),
+    "directions": ("V", 3),
+    "coefficients": ("V", 3),
+    "mean": (3,),
+    "lengths": (2,),
+    "falloff": (3,),
+}
 
 
 class Exposures(nn.Module):
@@ -53,31 +61,16 @@ class Exposures(nn.Module):
     lengths: torch.Tensor
     falloff: torch.Tensor
 
-    def __init__(
-        self,
-        log_gains: torch.Tensor,
-        positions: torch.Tensor,
-        directions: torch.Tensor,
-        coefficients: torch.Tensor,
-        mean: torch.Tensor,
-        lengths: torch.Tensor,
-        falloff: torch.Tensor | None = None,
-    ) -> None:
+    def __init__(self, buffers: Mapping[str, torch.Tensor]) -> None:
+        """Take the buffers by name; without `falloff`, which older model files do not have, the lens has none."""
         super().__init__()
-        if falloff is None:  # older model files have none
-            falloff = lengths.new_tensor(EVEN)
-        shapes = {
-            "log_gains": (log_gains, ("V", 3)),
-            "positions": (positions, ("V", 3)),
-            "directions": (directions, ("V", 3)),
-            "coefficients": (coefficients, ("V", 3)),
-            "mean": (mean, (3,)),
-            "lengths": (lengths, (2,)),
-            "falloff": (falloff, (3,)),
-        }
-        check_tensors(shapes)
-        for name, (tensor, _) in shapes.items():
-            self.register_buffer(name, tensor)
+        missing = [name for name in SHAPES if name not in buffers and name != "falloff"]
+        if missing:
+            raise ValueError(f"exposures: expected {missing[0]}, found none")
+        buffers = {"falloff": buffers["lengths"].new_tensor(EVEN), **buffers}
+        check_tensors({name: (buffers[name], shape) for name, shape in SHAPES.items()})
+        for name in SHAPES:
+            self.register_buffer(name, buffers[name])
         self._read_falloff()
         self.register_load_state_dict_post_hook(_read_falloff_again)  # no lambda: models can be pickled
 
@@ -103,23 +96,22 @@ class Exposures(nn.Module):
         positions, directions = (x[::stride] for x in poses_of(viewmats))
         gains = log_gains.double()[::stride]
         with one_thread():
-            size, squares = pose_distances(positions, directions)
+            size = (positions - positions.mean(0)).square().sum(1).mean().sqrt().clamp_min(1e-12)  # RMS spread
+            poses = torch.cat([positions, size * directions], 1)
+            squares = torch.cdist(poses, poses).square()
             kernels = [(matern_kernel(squares, length * size), length * size) for length in LENGTHS]
             fits = [(*fit_process(kernel, gains, noise), length) for kernel, length in kernels for noise in NOISES]
             _, coefficients, mean, length = min(fits, key=lambda fit: fit[0])
-        return cls(
-            gains.float(),
-            positions.float(),
-            directions.float(),
-            coefficients.round(decimals=5).float(),
-            mean.float(),
-            torch.stack([size, length]).float(),
-            torch.tensor([float(x) for x in falloff or EVEN]),
-        )
-
-    def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the buffers by name; `Exposures(**tensors)` makes a copy."""
-        return dict(self.named_buffers())
+        buffers = {
+            "log_gains": gains,
+            "positions": positions,
+            "directions": directions,
+            "coefficients": coefficients.round(decimals=5),
+            "mean": mean,
+            "lengths": torch.stack([size, length]),
+            "falloff": torch.tensor([float(x) for x in falloff or EVEN]),
+        }
+        return cls({name: x.float() for name, x in buffers.items()})
 
     @torch.no_grad()
     def gains(self, camera: Camera | RayCamera) -> torch.Tensor:
@@ -169,13 +161,6 @@ def matern_kernel(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
     """Evaluate the Matern 3/2 kernel at squared distances."""
     r = (3 * squares).sqrt() / length
     return (1 + r) * torch.exp(-r)
-
-
-def pose_distances(positions: torch.Tensor, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the RMS spread of camera positions (V, 3), and the squared distances (V, V) of poses."""
-    size = (positions - positions.mean(0)).square().sum(1).mean().sqrt().clamp_min(1e-12)
-    poses = torch.cat([positions, size * directions], 1)
-    return size, torch.cdist(poses, poses).square()
 
 
 def fit_process(kernel: torch.Tensor, values: torch.Tensor, noise: float) -> tuple[float, torch.Tensor, torch.Tensor]:

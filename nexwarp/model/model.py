@@ -57,15 +57,14 @@ class Model(nn.Module):
         super().__init__()
         if not isinstance(surfels, Surfels):
             raise TypeError(f"surfels: expected a nexwarp.Surfels, got {type(surfels).__name__}")
-        if options is not None and not isinstance(options, RenderOptions):
-            raise TypeError(f"options: expected a nexwarp.RenderOptions, got {type(options).__name__}")
         for name, value, kind in (
             ("texture", texture, NeuralTexture),
             ("exposures", exposures, Exposures),
             ("detail_limits", detail_limits, DetailLimits),
+            ("options", options, RenderOptions),
         ):
             if value is not None and not isinstance(value, kind):
-                raise TypeError(f"{name}: expected a {kind.__name__} or None, got {type(value).__name__}")
+                raise TypeError(f"{name}: expected a nexwarp.{kind.__name__} or None, got {type(value).__name__}")
         if detail_limits is not None and len(detail_limits) != len(surfels):
             raise ValueError(f"detail_limits: expected limits of {len(surfels)} surfels, got {len(detail_limits)}")
         self.surfels = surfels

@@ -18,7 +18,7 @@ from nexwarp.model.compact import CODE_NAMES, STORED, decode, encode
 from nexwarp.model.compact import DTYPES as COMPACT_DTYPES
 from nexwarp.model.detail import ORDERED, check_detail
 from nexwarp.model.detail_limits import NEVER, DetailLimits
-from nexwarp.model.exposures import BUFFERS, Exposures
+from nexwarp.model.exposures import SHAPES, Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions, check_removed
 from nexwarp.model.surfels import PARAMETERS, Surfels
@@ -38,11 +38,10 @@ DETAIL_LIMITS = {"nearest": "footprints", "farthest": "far_footprints"}
 FIXED_NAMES = {
     *(f"surfels.{name}" for name in PARAMETERS),
     *DETAIL_LIMITS.values(),
-    *(f"exposures.{name}" for name in BUFFERS),
+    *(f"exposures.{name}" for name in SHAPES),
 }
 # Options that files of nexwarp 0.1 do not have.
 LATER_OPTIONS = ("exposure", "detail_limits", "order")
-LATER_BUFFERS = ("falloff",)  # likewise, of exposures
 
 
 def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = False) -> Path:
@@ -161,12 +160,13 @@ def _read_options(meta: dict[str, Json]) -> RenderOptions:
 def _read_texture_shape(meta: dict[str, Json]) -> TextureShape | None:
     """Remove the arguments of the texture from the metadata and return them; the constructor checks their values."""
     shape = meta.pop("texture")
-    if shape is not None and not isinstance(shape, dict):
+    if shape is None:
+        return None
+    if not isinstance(shape, dict):
         raise ValueError(f"texture: expected the settings of a texture, got {shape!r:.60}")
-    if shape is not None and "parts" in shape:
+    if "parts" in shape:
         raise ValueError("texture: expected one texture: models merged from blocks were removed after 7f7bd6c")
-    known = {name: value for name, value in (shape or {}).items() if name in TextureShape.__annotations__}
-    return None if shape is None else cast(TextureShape, known)
+    return cast(TextureShape, {name: x for name, x in shape.items() if name in TextureShape.__annotations__})
 
 
 def _shapes_of(shape: TextureShape | None) -> dict[str, list[int]]:
@@ -201,20 +201,14 @@ def _make_model(
 ) -> Model:
     """Make a model from a full file's tensors and metadata; raise an error if they do not fit."""
     surfels = Surfels(_part(tensors, "surfels."))
-    limits = None
-    if any(stored in tensors for stored in DETAIL_LIMITS.values()):
-        for stored in DETAIL_LIMITS.values():
-            if stored in tensors:
-                check_tensors({stored: (tensors[stored], (len(surfels),))}, dtype=torch.float32)
+    limits, stored = None, {name: tensors[name] for name in DETAIL_LIMITS.values() if name in tensors}
+    if stored:
+        check_tensors({name: (x, (len(surfels),)) for name, x in stored.items()}, dtype=torch.float32)
         # Files of older versions may have only one of the two.
-        nearest = tensors.get(DETAIL_LIMITS["nearest"], surfels.means.new_zeros(len(surfels)))
-        farthest = tensors.get(DETAIL_LIMITS["farthest"], surfels.means.new_full((len(surfels),), NEVER))
-        limits = DetailLimits(nearest.detach(), farthest.detach())
+        without = {"footprints": torch.zeros(len(surfels)), "far_footprints": torch.full((len(surfels),), NEVER)}
+        limits = DetailLimits(*(without | stored).values())
     parts = _part(tensors, "exposures.")
-    missing = [name for name in BUFFERS if name not in parts and name not in LATER_BUFFERS]
-    if parts and missing:
-        raise ValueError(f"expected the tensor exposures.{missing[0]}, found none")
-    exposures = Exposures(**parts) if parts else None
+    exposures = Exposures(parts) if parts else None
     check_bounds(tensors)
     texture = None
     if shape is not None:

@@ -57,7 +57,7 @@ class SceneData:
 def _exposures(exposures: Exposures | None) -> dict[str, np.ndarray] | None:
     if exposures is None:
         return None
-    values = {name: array_of(x) for name, x in exposures.tensors().items()}
+    values = {name: array_of(x) for name, x in exposures.named_buffers()}
     poses = np.concatenate([values[name] for name in ("positions", "directions", "coefficients")], axis=1)
     gains = values["log_gains"]
     kept = {name: values[name] for name in ("mean", "lengths", "falloff")}
