@@ -136,21 +136,6 @@ def test_normals_are_the_mean_over_all_hits_and_face_the_camera(device: torch.de
     assert ((full.normals.norm(dim=-1)[hit] - 1).abs() < 1e-5).all()
 
 
-def test_nothing_in_view(tmp_path: Path) -> None:
-    scene = random_scene(4)
-    surfels = nw.Surfels.from_activated(
-        *(scene[k][:0] for k in ("means", "quats", "scales", "opacities", "gammas", "sh"))
-    )
-    options = nw.RenderOptions(background=BACKGROUND)
-    buffers = render_buffers(nw.Model(surfels, make_texture(), options=options), make_camera(scene))
-    save_buffers(tmp_path / "a.exr", buffers)
-    after = load_buffers(tmp_path / "a.exr")
-    assert torch.allclose(after.image, torch.tensor(BACKGROUND).expand_as(after.image))
-    for name in PASSES:
-        assert name in ("image", "ids") or (getattr(after, name) == 0).all(), name
-    assert (after.ids == -1).all()
-
-
 def test_bad_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"a\.exr: no such file, expected an OpenEXR file"):
         load_buffers(tmp_path / "a.exr")

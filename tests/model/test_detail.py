@@ -116,15 +116,3 @@ def test_models_without_an_order(
     expected = ordered(nw.load(file), cameras).at_detail(0.25)
     assert torch.equal(coarse.surfels.means, expected.surfels.means)
     refused(capsys, ["render", str(file), "--detail", "2"], "--detail: expected at least 0.0001 and at most 1, got 2")
-
-
-def test_a_finished_training_is_ordered(tmp_path: Path) -> None:
-    from tests.scene_writers import write_demo
-    from tests.trainer_support import small
-
-    scene = nw.load_scene(write_demo(tmp_path / "tiny", width=48, height=36, views=10, points=200))
-    config = small(iterations=2, exposures=False, smooth_sh=0.0, footprints=False)
-    model = nw.train(scene, config, device="cpu")
-    shares = picture_shares(model, [view.camera for view in scene.train])
-    assert model.meta["ordered"] is True
-    assert bool((shares[1:] <= shares[:-1] + 1e-6).all())

@@ -187,14 +187,6 @@ def test_a_capture_of_one_exposure_is_left_alone(tmp_path):
     assert choose_fit(shaded, cameras) is None
 
 
-def test_the_falloff_has_a_gate_of_its_own():
-    gains = 0.3 * torch.randn(12, 3, generator=torch.Generator().manual_seed(0)).double().clamp(-1, 1)
-    for lens, expected in (((0.0, 0.0), False), ((-0.5, 0.0), True)):
-        cameras, photos, points = photographs(gains, 0.1, lens)
-        seen = observations(views(cameras, photos, points))
-        assert (present(choose_fit(seen, cameras)).lens != 0).any() == expected
-
-
 def test_points_get_their_colours_at_the_mean_exposure(tmp_path):
     """Those of the scene without exposures, whatever the exposures of the photos; a point in no photo keeps its own."""
     scene = nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400))
@@ -243,16 +235,6 @@ def test_photos_that_share_nothing_keep_their_colours():
     assert choose_fit(observations(views(cameras, white, points)), cameras) is None
 
 
-def test_what_masks_leave_out_tells_nothing():
-    """A shade over the middle of one photo, in which most of its points lie, is masked."""
-    cameras, photos, points = photographs(torch.zeros(4, 3))
-    shade = torch.ones(48, 64, dtype=torch.bool)
-    shade[4:44, 4:60] = False
-    photos[1] = torch.where(shade[..., None], photos[1], photos[1] // 2)
-    assert abs(photo_gains(cameras, photos, points)[0]).max() > 0.1
-    assert abs(photo_gains(cameras, photos, points, [None, shade, None, None])[0]).max() < 0.01
-
-
 def test_a_camera_gets_the_gains_around_it():
     cameras = [looking(x) for x in np.linspace(0, 6, 25)]
     course = 0.3 * torch.sin(torch.linspace(0, 6, 25))[:, None] * torch.tensor([1.0, 0.5, -1.0])
@@ -269,14 +251,6 @@ def test_a_camera_gets_the_gains_around_it():
     far = exposures.gains(looking(1e6)).log()
     torch.testing.assert_close(far, exposures.mean, atol=1e-6, rtol=0)
     assert (far - course.mean(0)).abs().max() < 0.3
-
-
-def test_many_photos_are_thinned():
-    cameras = [looking(x) for x in np.linspace(0, 4, 2100)]
-    course = torch.linspace(-0.3, 0.3, 2100)[:, None].expand(2100, 3)
-    exposures = Exposures.of(course, cameras)
-    assert len(exposures.log_gains) == 700
-    torch.testing.assert_close(exposures.gains(cameras[1000]).log(), course[1000], atol=0.005, rtol=0)
 
 
 def test_gains_follow_a_scene_that_is_moved_and_scaled():

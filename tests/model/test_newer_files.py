@@ -14,7 +14,6 @@ import torch
 
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
-from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.data import Scene
 from nexwarp.data.scene import SceneSource
 from nexwarp.io.json_files import write_json
@@ -174,21 +173,6 @@ def many_frames(folder: Path) -> tuple[Path, Callable[[], object]]:
     return write_frames(folder, MANY), lambda: nw.load_scene(folder)
 
 
-def long_path(folder: Path) -> tuple[Path, Callable[[], object]]:
-    entries = repeated(json.dumps({"camera_to_world": [x for row in POSE for x in row], "fov": 50}), MANY)
-    file = folder / "path.json"
-    file.write_text(f'{{"render_width": 8, "render_height": 6, "camera_path": [{entries}]}}')
-    return file, lambda: load_camera_path(file)
-
-
-def many_cameras(folder: Path) -> tuple[Path, Callable[[], object]]:
-    camera = {"viewmat": POSE, "K": [[9, 0, 4], [0, 9, 3], [0, 0, 1]], "width": 8, "height": 6, "near": 0.1}
-    file = folder / "cameras.json"
-    entries = repeated(f'"a": {json.dumps(camera)}', MANY)
-    file.write_text(f'{{"train": {{{entries}}}, "test": {{}}}}')
-    return file, lambda: load_cameras(file)
-
-
 def many_tensors(folder: Path) -> tuple[Path, Callable[[], object]]:
     file = save_model(folder, tiny_model())
     entries = {f"x{i}": {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for i in range(100_000)}
@@ -201,8 +185,6 @@ def many_tensors(folder: Path) -> tuple[Path, Callable[[], object]]:
     ("make", "match"),
     [
         (many_frames, "expected at most 500,000 lists and objects, got 900,"),
-        (long_path, "camera_path: expected a list of at least one camera, at most 30,000"),
-        (many_cameras, "expected at most 500,000 lists and objects, got 1,500,003"),
         (many_tensors, "expected a safetensors header of at most 1,048,576 bytes"),
     ],
 )

@@ -11,7 +11,6 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import look_at
 from nexwarp.data import Scene, View
 from nexwarp.model.surfels import Surfels
-from nexwarp.train.finish import sh_smoothing
 from nexwarp.train.finish.sh_smoothing import seen_directions, smooth_sh
 from nexwarp.train.recipe import MAX_STRENGTH, MIN_STRENGTH, Config, TextureConfig
 from nexwarp.train.trainer import Trainer
@@ -155,32 +154,6 @@ def test_unseen_surfels_get_one_colour_and_none_are_no_trouble(device: torch.dev
     flat = Surfels({name: x[:, :0] if name == "shN" else x for name, x in surfels.state_dict().items()})
     for a, b in zip(smooth_sh(nw.Model(flat, None), views, 0.01), (flat.sh0, flat.shN), strict=True):
         assert torch.equal(a, b)
-
-
-@pytest.mark.parametrize("degree", [1, 2])
-def test_degrees_that_are_not_rendered_take_no_part(device: torch.device, degree: int) -> None:
-    """As if the surfels had no others; what they have above stays."""
-    surfels, views = blob(device), around([-0.5, 0.0, 0.5])
-    count = (degree + 1) ** 2
-    less = Surfels({name: x[:, : count - 1] if name == "shN" else x for name, x in surfels.state_dict().items()})
-    sh0, shN = smooth_sh(nw.Model(surfels, None, options=nw.RenderOptions(sh_degree=degree)), views, 0.01)
-    for a, b in zip((sh0, shN[:, : count - 1]), smooth_sh(nw.Model(less, None), views, 0.01), strict=True):
-        assert_close(a, b, kind="value", name="degrees")
-    assert torch.equal(shN[:, count - 1 :], surfels.shN[:, count - 1 :])
-
-
-def test_many_surfels_are_seen_and_solved_in_parts(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
-    surfels, views = make_surfels(random_scene(50, device=device)), around([0.0, 0.4])
-    told: list[tuple[int, int]] = []
-    whole = smooth_sh(nw.Model(surfels, None), views, 0.01, lambda *done: told.append(done))
-    assert told == [(1, 2), (2, 2)]
-    monkeypatch.setattr(sh_smoothing, "SOLVED", 7 * 16**2)
-    monkeypatch.setattr(sh_smoothing, "PRODUCTS", 20 * 16 * 17 // 2)
-    told.clear()
-    parts = smooth_sh(nw.Model(surfels, None), views, 0.01, lambda *done: told.append(done))
-    assert told == [(done, 6) for done in range(1, 7)]  # 20, 20 and 10 surfels
-    for a, b in zip(parts, whole, strict=True):
-        assert_close(a, b, kind="value", name="parts")
 
 
 @pytest.fixture(scope="module")
