@@ -1,4 +1,4 @@
-"""Helpers render test scenes, hand them to the reference, and compare results."""
+"""Rendering of test scenes, also by the reference, and comparison of results."""
 
 import copy
 from typing import Any
@@ -9,6 +9,7 @@ import nexwarp as nw
 from nexwarp.model.render import draw as draw_parts
 from tests.narrowing import present
 from tests.reference import render as reference
+from tests.reference.collect import Shape, View
 from tests.scenes import Scene, make_camera, make_surfels
 from tests.tolerances import assert_close
 
@@ -50,19 +51,20 @@ def loss(out: Any) -> torch.Tensor:
     return total
 
 
+def view_of(camera: nw.Camera, order: str = "depth") -> View:
+    return View(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near, order)
+
+
 def reference_render(
-    surfels: nw.Surfels, texture: nw.NeuralTexture | None, camera: nw.Camera, **options: Any
+    surfels: nw.Surfels, texture: nw.NeuralTexture | None, camera: nw.Camera, *, order: str = "depth", **options: Any
 ) -> reference.Rendering:
     """Hand the public objects, in float64 on the CPU, to the reference."""
     field = None
     if texture is not None:
         mlp = list(texture.mlp.parameters())
         field = reference.Texture(texture.grid, texture.resolutions.double(), mlp, texture.residual)
-    return reference.render(
-        surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas, surfels.sh, field,
-        camera.viewmat, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near,
-        **options,
-    )  # fmt: skip
+    shape = Shape(surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
+    return reference.render(shape, surfels.sh, field, camera.viewmat, view_of(camera, order), **options)
 
 
 def rigid_gradient(viewmat: torch.Tensor) -> torch.Tensor:

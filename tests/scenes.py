@@ -110,6 +110,30 @@ def layered_scene(
     return finish(scene, dtype, device)
 
 
+def named_scene(name: str, dtype: torch.dtype, device: torch.device | str) -> Scene:
+    """Make one of the scenes on which renderings are compared: "random", "off_centre", "specks", "layered", "wide"."""
+    if name == "layered":
+        return layered_scene(dtype=dtype, device=device)
+    if name == "wide":  # a view of 90 degrees, in whose corners z-depth and distance sort surfels differently
+        scene = random_scene(60, seed=4, width=36, height=28, dtype=dtype, device=device)
+        scene["K"][0, 0] = scene["K"][1, 1] = 16.0
+        return scene
+    scene = random_scene(seed=1, off_centre=name == "off_centre", dtype=dtype, device=device)
+    if name == "specks":
+        scene["scales"] *= 0.1
+    return scene
+
+
+def moved_scene(scene: Scene, quat: tuple[float, ...], translation: tuple[float, ...]) -> Scene:
+    """Apply a rigid motion to the surfels and the camera of a scene."""
+    motion = rigid(quat, translation).to(scene["means"])
+    return scene | {
+        "means": scene["means"] @ motion[:3, :3].T + motion[:3, 3],
+        "quats": multiply(torch.tensor([quat], dtype=torch.float64).to(scene["quats"]), scene["quats"]),
+        "viewmat": scene["viewmat"] @ motion.inverse(),
+    }
+
+
 def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Hamilton product (N, 4), wxyz."""
     aw, ax, ay, az = a.unbind(-1)

@@ -99,20 +99,17 @@ def test_depth_and_normals_are_those_of_the_rendering(model: Path, tmp_path: Pat
     assert all(size_of(tmp_path / name) == (camera.width, camera.height) for name in names)
 
 
-def test_frames_along_a_path_are_written(model: Path, tmp_path: Path) -> None:
-    run("render_path", "--model", model, "--out", tmp_path, "--frames", 3)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [f"frame_{i:04d}.png" for i in range(3)]
-    assert {size_of(path) for path in tmp_path.iterdir()} == {(48, 36)}
-
-
 @pytest.mark.skipif(importlib.util.find_spec("av") is None, reason="PyAV is not installed")
-def test_a_video_along_a_path_is_written(model: Path, tmp_path: Path) -> None:
+def test_frames_and_a_video_along_a_path_are_written(model: Path, tmp_path: Path) -> None:
     import av
 
+    run("render_path", "--model", model, "--out", tmp_path / "frames", "--frames", 3)
+    frames = sorted((tmp_path / "frames").iterdir())
+    assert [path.name for path in frames] == [f"frame_{i:04d}.png" for i in range(3)]
+    assert {size_of(path) for path in frames} == {(48, 36)}
     run("render_path", "--model", model, "--out", tmp_path / "around.mp4", "--frames", 3, "--height", 72, "--white")
     with av.open(str(tmp_path / "around.mp4")) as video:
-        frames = list(video.decode(video=0))
-    assert len(frames) == 3 and (frames[0].width, frames[0].height) == (96, 72)
+        assert [(frame.width, frame.height) for frame in video.decode(video=0)] == [(96, 72)] * 3
 
 
 def test_a_pixel_is_drawn_without_nexwarp(model: Path) -> None:

@@ -51,10 +51,16 @@ def named(text: str) -> list[str]:
     return re.findall(r"^\| `([^`]+)` \|", text, re.M)
 
 
-def header(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    data = (run / "model.safetensors").read_bytes()
+def header_of(file: Path) -> dict[str, Any]:
+    data = file.read_bytes()
     (size,) = struct.unpack("<Q", data[:8])
-    tensors = json.loads(data[8 : 8 + size])
+    header = json.loads(data[8 : 8 + size])
+    assert isinstance(header, dict)
+    return header
+
+
+def header(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    tensors = header_of(run / "model.safetensors")
     metadata = tensors.pop("__metadata__")
     assert set(metadata) == {"nexwarp"}
     return tensors, json.loads(metadata["nexwarp"])
@@ -168,25 +174,26 @@ def test_json_files(run):
 
 
 def test_checkpoint(run):
-    data = (run / "checkpoint" / "tensors.safetensors").read_bytes()
-    (size,) = struct.unpack("<Q", data[:8])
-    groups = {name.split(".")[0] for name in json.loads(data[8 : 8 + size]) if name != "__metadata__"}
+    groups = {name.split(".")[0] for name in header_of(run / "checkpoint" / "tensors.safetensors")} - {"__metadata__"}
     assert groups == set(re.findall(r"`(\w+)\.\*`", section("checkpoint/")))
 
 
 # The Python of docs/paper.md, docs/migrating.md, docs/depth.md and the README
 
 
-def test_examples(run, tmp_path, monkeypatch, capsys):
-    """The Python in the pages runs as it stands."""
+def python_of(page: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.S)
+
+
+def test_the_python_of_paper_and_migrating_runs(run, tmp_path, monkeypatch, capsys):
     (tmp_path / "runs" / "one").mkdir(parents=True)
     shutil.copy(run / "metrics.json", tmp_path / "runs" / "one")
     monkeypatch.chdir(tmp_path)
-    (means,) = re.findall(r"```python\n(.*?)```", (DOCS / "paper.md").read_text(encoding="utf-8"), re.S)
+    (means,) = python_of("docs/paper.md")
     exec(means, {})
     metrics = json.loads((run / "metrics.json").read_text())
     assert capsys.readouterr().out == f"{ {key: metrics[key] for key in ('psnr', 'ssim', 'megabytes', 'seconds')} }\n"
-    (example,) = re.findall(r"```python\n(.*?)```", (DOCS / "migrating.md").read_text(encoding="utf-8"), re.S)
+    (example,) = python_of("docs/migrating.md")
     names: dict[str, Any] = {}
     exec(example, names)
     assert names["image"].shape == (200, 300, 3) and names["image"].max() > 0.1
@@ -196,7 +203,7 @@ def test_the_readme_s_python_runs(run, tmp_path, monkeypatch, capsys):
     """As it stands, where a run of the demo is."""
     shutil.copytree(run, tmp_path / "runs" / "demo")
     monkeypatch.chdir(tmp_path)
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
+    (example,) = python_of("README.md")
     assert len([line for line in example.splitlines() if line]) <= 12
     names: dict[str, Any] = {}
     exec(example, names)
@@ -210,7 +217,7 @@ def test_the_depth_page_s_python_runs(run, tmp_path, monkeypatch):
     shutil.copytree(run, tmp_path / "runs" / "demo")
     monkeypatch.chdir(tmp_path)
     assert cli.main(["render", "runs/demo", "--set", "test", "--buffers"]) == 0
-    examples = re.findall(r"```python\n(.*?)```", (DOCS / "depth.md").read_text(encoding="utf-8"), re.S)
+    examples = python_of("docs/depth.md")
     assert len(examples) == 2
     for example in examples:
         exec(example, {})

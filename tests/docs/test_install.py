@@ -15,10 +15,9 @@ import nexwarp
 ROOT = Path(__file__).parents[2]
 
 
-def build(kind: str, clone: Path, folder: Path) -> Path:
-    """Build a wheel of a clone with setuptools."""
+def build_editable(clone: Path, folder: Path) -> Path:
     pytest.importorskip("setuptools", reason="needs setuptools (extra dev)")
-    code = f"import setuptools.build_meta as b; b.build_{kind}({str(folder)!r})"
+    code = f"import setuptools.build_meta as b; b.build_editable({str(folder)!r})"
     subprocess.run([sys.executable, "-c", code], cwd=clone, check=True, capture_output=True)
     (wheel,) = folder.glob("*.whl")
     return wheel
@@ -39,22 +38,13 @@ def clone(tmp_path: Path) -> Path:
 def test_an_editable_package_is_found_in_the_folder_above_the_clone(clone: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
     site.mkdir()
-    with zipfile.ZipFile(build("editable", clone, site)) as wheel:
+    with zipfile.ZipFile(build_editable(clone, site)) as wheel:
         wheel.extractall(site)
     for folder in (tmp_path, clone, clone / "nexwarp", site):
         # Without the site-packages of this environment (-S), which hold another nexwarp.
         code = f"import site; site.addsitedir({str(site)!r}); import nexwarp; print(nexwarp.render)"
         done = subprocess.run([sys.executable, "-S", "-c", code], cwd=folder, capture_output=True, text=True, env={})
         assert (done.stdout, done.stderr) == ("the function\n", ""), folder
-
-
-def test_a_wheel_holds_the_package_alone(clone: Path, tmp_path: Path) -> None:
-    (clone / "tests").mkdir()
-    (clone / "tests" / "__init__.py").touch()
-    dist = tmp_path / "dist"
-    dist.mkdir()
-    names = zipfile.ZipFile(build("wheel", clone, dist)).namelist()
-    assert sorted(n for n in names if ".dist-info/" not in n) == ["nexwarp/__init__.py", "nexwarp/py.typed"]
 
 
 def test_the_version_has_one_value() -> None:

@@ -7,28 +7,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2] / "nexwarp"
 # The one list of layers, from the top to the bottom, is in CONTRIBUTING.md.
 (BLOCK,) = re.findall(r"```layers\n(.*?)```", (ROOT.parent / "CONTRIBUTING.md").read_text(encoding="utf-8"), re.S)
 LAYERS = [line.split() for line in reversed(BLOCK.splitlines())]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 EXEMPT = {"__init__", "__main__"}
-PURE = {
-    "ctypes",
-    "math",
-    "collections",
-    "functools",
-    "concurrent",
-    "os",
-    "threading",
-    "typing",
-    "dataclasses",
-    "types",
-    "contextlib",
-}
+PURE = set("warp __future__ ctypes math collections functools concurrent os threading typing dataclasses".split())
+PURE |= {"types", "contextlib"}
 MOST_ROOMS, MOST_ARROWS = 17, 80  # benchmarks and notebooks are two of the rooms
+MOST_OF_TRAINER = 18  # modules of ours that the trainer imports
 
 TIMED_IMPORT = """
 import time, torch
@@ -51,7 +39,6 @@ def imported_modules(path: Path) -> set[str]:
 
 
 def modules() -> list[Path]:
-    """All files of the package."""
     return sorted(ROOT.rglob("*.py"))
 
 
@@ -79,6 +66,13 @@ def test_imports_point_downwards() -> None:
     assert len({arrow for arrow in arrows if arrow[0] != arrow[1]}) <= MOST_ARROWS
 
 
+def test_the_trainer_imports_few_modules() -> None:
+    ours = {name for name in imported_modules(ROOT / "train" / "trainer.py") if name.startswith("nexwarp.")}
+    files = {name.replace(".", "/") for name in ours}
+    modules_of_ours = {name if (ROOT.parent / f"{name}.py").is_file() else name.rpartition("/")[0] for name in files}
+    assert len(modules_of_ours) <= MOST_OF_TRAINER, sorted(modules_of_ours)
+
+
 def test_types_say_something() -> None:
     """Outside kernels: few `Any`, and no SimpleNamespace."""
     any_, loose = 0, []
@@ -97,31 +91,20 @@ def test_kernels_are_pure_warp() -> None:
     for path in sorted([*(ROOT / "kernels").rglob("*.py"), *(ROOT / "native").rglob("*.py")]):
         for dotted in imported_modules(path):
             root = dotted.split(".")[0]
-            pure = root in PURE | {"__future__", "warp"} or dotted.startswith(("nexwarp.kernels", "nexwarp.native"))
+            pure = root in PURE or dotted.startswith(("nexwarp.kernels", "nexwarp.native"))
             assert pure, f"{path}: imports {dotted}"
 
 
-@pytest.fixture(scope="module")
-def fresh_imports(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[float], list[Path]]:
-    """CPU seconds of three imports in fresh processes, and the files they left in an empty Warp cache."""
-    cache = tmp_path_factory.mktemp("warp")
+def test_import_is_quick_and_compiles_nothing(tmp_path: Path) -> None:
+    """In the least of three fresh processes."""
     command = [sys.executable, "-c", TIMED_IMPORT]
-    environment = os.environ | {"WARP_CACHE_PATH": str(cache)}
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
     seconds = []
     for _ in range(3):
         run = subprocess.run(command, env=environment, cwd=ROOT.parent, capture_output=True, text=True, check=True)
         seconds.append(float(run.stdout.splitlines()[-1]))
-    return seconds, [path for path in cache.rglob("*") if path.is_file()]
-
-
-def test_import_is_quick(fresh_imports: tuple[list[float], list[Path]]) -> None:
-    seconds, _ = fresh_imports
     assert min(seconds) <= 1.5, f"import nexwarp took {seconds} s beyond import torch"
-
-
-def test_import_compiles_nothing(fresh_imports: tuple[list[float], list[Path]]) -> None:
-    _, files = fresh_imports
-    assert not files
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 USES = """

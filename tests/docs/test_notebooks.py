@@ -9,7 +9,7 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from notebooks.__main__ import FOLDER, NAMES, execute, main
+from notebooks.__main__ import FOLDER, NAMES, execute
 
 ROOT = FOLDER.parent
 LARGEST = 3_000_000  # bytes, of the whole folder
@@ -23,17 +23,6 @@ def code_cells(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
 def pictures(notebook: nbformat.NotebookNode) -> list[int]:
     """How many pictures each cell gives."""
     return [sum("data" in output for output in cell.outputs) for cell in code_cells(notebook)]
-
-
-def write(path: Path, *sources: str) -> Path:
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source) for source in sources])
-    notebook.metadata["kernelspec"] = {"display_name": "Python 3", "language": "python", "name": "python3"}
-    nbformat.write(notebook, path)
-    return path
-
-
-def test_there_are_four() -> None:
-    assert NAMES == ["01_one_surfel", "02_passes", "03_train", "04_gpu_vs_cpu"]
 
 
 @pytest.mark.long
@@ -77,23 +66,13 @@ def test_folder_is_small() -> None:
     assert sum(path.stat().st_size for path in FOLDER.glob("*.ipynb")) < LARGEST
 
 
-@pytest.mark.parametrize(
-    ("source", "expected"),
-    [("assert 1 == 2", "AssertionError"), ("import warnings; warnings.warn('old')", "nothing on stderr.*old")],
-)
-def test_failure_or_warning_keeps_the_old_outputs(source: str, expected: str, tmp_path: Path) -> None:
-    path = write(tmp_path / "a.ipynb", "1 + 1", source)
+@pytest.mark.parametrize("source", ["assert 1 == 2", "import warnings; warnings.warn('old')"])
+def test_failure_or_warning_keeps_the_old_outputs(source: str, tmp_path: Path) -> None:
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(source)])
+    notebook.metadata["kernelspec"] = {"display_name": "Python 3", "language": "python", "name": "python3"}
+    path = tmp_path / "a.ipynb"
+    nbformat.write(notebook, path)
     before = path.read_bytes()
-    with pytest.raises(RuntimeError, match=f"(?s)a.ipynb.*{expected}"):
+    with pytest.raises(RuntimeError, match=r"a\.ipynb"):
         execute(path, path)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [(["--short"], "--short: expected with --out"), (["05_none"], "NAME: expected some of 01_one_surfel")],
-)
-def test_bad_arguments_are_named(arguments: list[str], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main(arguments)
-    assert expected in capsys.readouterr().err

@@ -5,7 +5,6 @@ import json
 import re
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 from packaging.markers import default_environment
@@ -79,33 +78,17 @@ def test_locks_are_the_constraints(python: str, platform: dict[str, str]) -> Non
             assert requirement.specifier.contains(version), f"{locks}: {requirement} is {version}"
 
 
-# .ci/audit.py
-
-
-@pytest.fixture(scope="module")
-def audit() -> ModuleType:
+def test_a_vulnerability_fails_the_audit() -> None:
+    """And an audit that skipped everything is none."""
     spec = importlib.util.spec_from_file_location("audit", ROOT / ".ci" / "audit.py")
     assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_an_audit_that_skipped_everything_is_none(audit: ModuleType) -> None:
-    skipped = {"dependencies": [{"name": "numpy", "skip_reason": "not found on PyPI and could not be audited"}]}
-    assert audit.judge("pypi", json.dumps(skipped)) is None
-    assert audit.judge("osv", "") is None
-
-
-def test_a_vulnerability_fails_the_audit(audit: ModuleType) -> None:
+    audit = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(audit)
     bad = {"name": "numpy", "version": "1.0", "vulns": [{"id": "CVE-1", "fix_versions": ["1.1", "2.0"]}]}
     good = {"name": "torch", "version": "2.0", "vulns": []}
     skipped = {"name": "rich", "skip_reason": "no answer"}
-    assert audit.judge("osv", json.dumps({"dependencies": [good, skipped]})) == (
-        0,
-        "audited 1 of 2 packages with osv: 0 vulnerabilities",
-    )
-    assert audit.judge("osv", json.dumps({"dependencies": [good, bad]})) == (
-        1,
-        "numpy 1.0: CVE-1, fixed in 1.1, 2.0\naudited 2 of 2 packages with osv: 1 vulnerabilities",
-    )
+    passed = audit.judge("osv", json.dumps({"dependencies": [good, skipped]}))
+    assert passed == (0, "audited 1 of 2 packages with osv: 0 vulnerabilities")
+    code, text = audit.judge("osv", json.dumps({"dependencies": [good, bad]}))
+    assert code == 1 and text.startswith("numpy 1.0: CVE-1, fixed in 1.1, 2.0\n")
+    assert audit.judge("pypi", json.dumps({"dependencies": [skipped]})) is None and audit.judge("osv", "") is None

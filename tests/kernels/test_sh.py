@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from nexwarp import ops
-from nexwarp.kernels import launch
 from tests.narrowing import present
 from tests.reference import sh as reference
 from tests.tolerances import assert_close
@@ -93,25 +92,6 @@ def test_clamped_channels_have_no_gradient(device: torch.device) -> None:
     assert not colors.any() and not gradient.any()
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_a_surfel_at_the_camera_takes_the_forward_direction(dtype: torch.dtype, device: torch.device) -> None:
-    sh0, shN, means, position = make(5, 3, dtype, device)
-    with torch.no_grad():
-        sh0.fill_(3.0)
-        shN *= 0.1
-        means[2] = position
-    leaves = [sh0, shN, means, position]
-    colors = colors_of(leaves, 3)
-    forward = torch.tensor([0.0, 0.0, 1.0], dtype=dtype, device=device)
-    expected = 0.5 + reference.evaluate(torch.cat([sh0, shN], dim=1)[2], forward, 3)
-    assert_close(colors[2], expected, kind="value", name="colour at the camera")
-    grad_sh0, grad_shN, grad_means, grad_position = gradients(leaves, 3)
-    assert not grad_means[2].any() and grad_means[3].any()
-    for name, x in zip(NAMES, (grad_sh0, grad_shN, grad_means, grad_position), strict=True):
-        assert x.isfinite().all(), name
-    assert grad_sh0[2].all() and grad_shN[2].any()
-
-
 def test_gradcheck(device: torch.device) -> None:
     assert torch.autograd.gradcheck(lambda *x: colors_of(list(x), 3), make(6, 3, torch.float64, device))
 
@@ -126,50 +106,3 @@ def test_one_gradient_alone(wanted: str, device: torch.device) -> None:
     colors.backward(signal(colors))
     for name, x in zip(NAMES, leaves, strict=True):
         assert torch.equal(present(x.grad), expected[name]) if name == wanted else x.grad is None, name
-
-
-def test_no_surfels(device: torch.device) -> None:
-    leaves = make(0, 3, torch.float32, device)
-    colors = colors_of(leaves, 3)
-    assert colors.shape == (0, 3)
-    colors.sum().backward()
-    for x in leaves:
-        gradient = present(x.grad)
-        assert gradient.shape == x.shape and not gradient.any()
-
-
-def test_strided_input(device: torch.device) -> None:
-    sh0, shN, means, position = make(30, 3, torch.float64, device)
-    strided = torch.cat([sh0, shN], dim=1).detach().requires_grad_()
-    colors = ops.plain_colors((strided[:, :1], strided[:, 1:]), means, position, 3)
-    assert torch.equal(colors, ops.plain_colors((sh0, shN), means, position, 3))
-    colors.backward(signal(colors))
-    grad_sh0, grad_shN, _, _ = gradients([sh0, shN, means, position], 3)
-    assert torch.equal(present(strided.grad), torch.cat([grad_sh0, grad_shN], dim=1))
-
-
-def test_plain_colors_do_not_depend_on_threads() -> None:
-    leaves = make(1500, 3, torch.float32)
-    before = launch.get_num_threads()
-    results = []
-    for count in (1, 3):
-        launch.set_num_threads(count)
-        results.append([colors_of(leaves, 3), *gradients(leaves, 3)])
-    launch.set_num_threads(before)
-    assert all(torch.equal(x, y) for x, y in zip(*results, strict=True))
-
-
-def test_bad_input() -> None:
-    sh0, shN, means, position = make(4, 3)
-    with pytest.raises(ValueError, match=r"^shN: expected shape \(N=4, C - 1=15, 3\), got \(3, 15, 3\)$"):
-        ops.plain_colors((sh0, shN[:3]), means, position, 3)
-    with pytest.raises(ValueError, match=r"^sh0: expected shape \(N=4, 1, 3\), got \(4, 15, 3\)$"):
-        ops.plain_colors((shN, shN), means, position, 3)
-
-
-def test_no_surfels_give_empty_gradients() -> None:
-    """Also when the gradient comes expanded from a sum, with strides that no contiguous tensor has."""
-    leaves = [torch.zeros(0, *shape, requires_grad=True) for shape in ((3,), (4,), (2,), (), (2,), (3,))]
-    means, quats, scales, opacities, gammas, colors = leaves
-    ops.project(means, quats, scales, opacities, gammas, colors, torch.eye(4)).records.sum().backward()
-    assert [present(x.grad).shape for x in leaves] == [x.shape for x in leaves]

@@ -1,6 +1,5 @@
 """Our Adam takes torch's steps, regularises the grid as the loss does, and shares its checkpoints."""
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,10 +9,8 @@ import nexwarp as nw
 from nexwarp.ops.adam import Moments, adam_step
 from nexwarp.train.adam import FusedAdam, grid_factors
 from nexwarp.train.losses import grid_loss
-from nexwarp.train.recipe import LossWeights, TextureConfig
-from nexwarp.train.schedules import EPSILON
+from nexwarp.train.recipe import LossWeights
 from nexwarp.train.state import gather_optimizer, restore_optimizer
-from nexwarp.train.trainer import Trainer
 from tests.tolerances import assert_close
 
 WEIGHTS = LossWeights(grid=0.01)
@@ -103,22 +100,6 @@ def test_grids_of_any_size_are_regularised(shape: tuple[int, int, int], device: 
     assert_close(ours, theirs - 0.1 * grad.sign(), kind="value", name="grid")
 
 
-def test_parameters_without_a_gradient_stay(device: torch.device) -> None:
-    """But for the regularised grid, which has the regulariser's."""
-    texture, parameters = make_parameters(device)
-    before = {name: x.detach().clone() for name, x in parameters.items()}
-    optimizer = make_optimizer(FusedAdam, parameters)
-    assert isinstance(optimizer, FusedAdam)
-    optimizer.regularise(texture, grid_factors(texture, WEIGHTS, 1.0))
-    optimizer.step()
-    assert torch.equal(parameters["small"], before["small"]) and parameters["small"] not in optimizer.state
-    assert (
-        parameters["grid"].abs() < before["grid"].abs()
-    ).float().mean() > 0.9  # Adam's first step has the rate's size
-    with pytest.raises(TypeError, match=r"^closure: expected None"):
-        optimizer.step(lambda: 0.0)
-
-
 @pytest.mark.parametrize("kinds", [(FusedAdam, torch.optim.Adam), (torch.optim.Adam, FusedAdam)], ids=["new", "old"])
 def test_checkpoints_are_those_of_torch(kinds: tuple[type[torch.optim.Adam], ...], device: torch.device) -> None:
     """Each continues what the other has begun."""
@@ -143,27 +124,3 @@ def test_checkpoints_are_those_of_torch(kinds: tuple[type[torch.optim.Adam], ...
         run(made, values, slice(3, 6))
     for name, parameter in parameters.items():
         assert_close(copies[name], parameter, kind="value", name=name)
-
-
-def test_trainings_resume_from_torchs_adam(tmp_path: Path, tiny_scene: nw.Scene, device: torch.device) -> None:
-    """A checkpoint written with torch's Adam and the grid's loss continues as if ours had written it."""
-    texture = TextureConfig(table_size=2**10)
-    config = nw.Config(iterations=20, max_surfels=300, texture=texture, deterministic=True)
-
-    def on_device(groups: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        return [group | {"lr": torch.tensor(group["lr"], device=device)} for group in groups]
-
-    def theirs(groups: list[dict[str, Any]]) -> torch.optim.Adam:
-        return torch.optim.Adam(on_device(groups), eps=EPSILON, fused=True, capturable=device.type == "cuda")
-
-    trainers = [Trainer(tiny_scene, config, device, optimizer=make) for make in (None, theirs)]
-    assert isinstance(trainers[0].optimizer, FusedAdam)
-    trainers[1].run(until=10)
-    trainers[1].save(tmp_path)
-    trainers[0].restore(tmp_path)
-    reports = [trainer.step() for trainer in trainers]
-    assert set(reports[0].losses) == set(reports[1].losses)
-    for name, loss in reports[0].losses.items():
-        assert_close(loss, reports[1].losses[name], kind="value", name=name)
-    for (name, ours), (_, torchs) in zip(*(t._named_parameters() for t in trainers), strict=True):
-        assert_close(ours, torchs, kind="value", name=name)

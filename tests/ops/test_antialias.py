@@ -86,11 +86,3 @@ def test_widening_of_extremes_is_finite(device: torch.device) -> None:
     grads = torch.autograd.grad([x.sum() for x in found], shape)
     for name, grad in zip(("depths", "scales", "opacities", "gammas"), grads, strict=True):
         assert_finite(grad, name)
-
-
-def test_bad_arguments_are_named() -> None:
-    shape, farthest = arguments(6, torch.float32, torch.device("cpu"))
-    with pytest.raises(ValueError, match="farthest"):
-        ops.antialias(*shape, farthest[:4], 90.0)
-    with pytest.raises(TypeError, match="gammas"):
-        ops.antialias(*shape[:3], shape[3].double(), farthest, 90.0)

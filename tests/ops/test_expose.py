@@ -38,11 +38,3 @@ def test_exposed_images_and_gradients_are_torchs(device: torch.device, dtype: to
     colors = expose(leaves[0], leaves[1], given[0], given[1], SATURATION)[1]
     (alone,) = torch.autograd.grad(colors, leaves[1], signals[1].to(leaves[1]))
     assert_close(alone, gradients[1], kind="gradient", name="gradient alone")
-
-
-def test_what_does_not_fit_is_refused(device: torch.device) -> None:
-    image = torch.rand(4, 5, 3, device=device)
-    with pytest.raises(ValueError, match="exposure"):
-        expose(image, image, torch.ones(4, device=device), image, SATURATION)
-    with pytest.raises(ValueError, match="photo: expected a tensor that needs no gradient"):
-        expose(image, image, torch.ones(3, device=device), image.clone().requires_grad_(), SATURATION)

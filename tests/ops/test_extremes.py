@@ -4,12 +4,10 @@ from typing import Any
 
 import pytest
 import torch
-import warp as wp
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.kernels.tiles import LARGEST_INT, MAX_ENTRIES, check_entries
-from nexwarp.ops import tape as warp_passes
+from nexwarp.kernels.tiles import LARGEST_INT, MAX_ENTRIES
 from tests.narrowing import present
 from tests.scenes import SURFEL_KEYS, Scene, detached_shape, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close, assert_finite
@@ -94,9 +92,8 @@ def test_extreme_surfels_are_finite(case: str, device: torch.device) -> None:
 @pytest.mark.parametrize("factor", [1e4, 1e8, 1e15])
 def test_huge_worlds_are_finite(factor: float, device: torch.device) -> None:
     scene = scene_with(device)
-    far = scene | {"means": factor * scene["means"]}
-    check_finite(far)
-    check_finite(far | {"scales": factor * scene["scales"]})
+    check_finite(scene | {"means": factor * scene["means"]})
+    check_finite(scene | {"means": factor * scene["means"], "scales": factor * scene["scales"]})
 
 
 @pytest.mark.parametrize("near", [0.0, 0.01])
@@ -120,14 +117,6 @@ def test_gamma_1000_is_a_quad(device: torch.device) -> None:
     expected = torch.zeros(16, 16)
     expected[4:12, 4:12] = 0.9
     assert_close(check_finite(facing(device, gammas=1e3)).alpha, expected, kind="value", name="alpha")
-
-
-def test_opacity_at_both_ends(device: torch.device) -> None:
-    scene = facing(device, scales=1e8)
-    opaque = check_finite(scene | {"opacities": torch.ones(1, device=device)})
-    assert_close(opaque.alpha, torch.full((16, 16), 0.99), kind="value", name="alpha")
-    for raw in (-100.0, -1e4):
-        assert not check_finite(scene, {"logit_opacities": raw}).alpha.any()
 
 
 @pytest.mark.parametrize(("scales", "opacity"), [(1e-8, 0.9), (1e8, 1.0)])
@@ -212,20 +201,6 @@ def test_more_entries_than_lists_can_have_are_refused(count: int, device: torch.
         nw.render(surfels, None, camera, max_hits=0)
     for text in (f"of {count:,} surfels and {tiles:,} tiles", "render fewer"):
         assert text in str(caught.value)
-    with pytest.raises(ValueError, match=REFUSED):
-        warp_lists(surfels, camera)
-
-
-def warp_lists(surfels: nw.Surfels, camera: nw.Camera) -> Any:
-    """What a program without torch calls."""
-    shape = detached_shape(surfels)
-    centers = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat).centers.detach()
-    kinds = (wp.vec3, wp.vec4, wp.vec2, wp.float32, wp.vec2, wp.vec3, wp.mat44)
-    tensors = (*shape, centers, camera.viewmat.detach()[None].contiguous())
-    arrays = [wp.from_torch(x.contiguous(), dtype=kind) for x, kind in zip(tensors, kinds, strict=True)]
-    means, quats, scales, opacities, gammas, positions, viewmat = (x for x in arrays if isinstance(x, wp.array))
-    image = warp_passes.Image((camera.fx, camera.fy, camera.cx, camera.cy), (camera.width, camera.height), camera.near)
-    return warp_passes.intersect_tiles(means, quats, scales, opacities, gammas, positions, viewmat, image)
 
 
 @pytest.mark.parametrize("count", [9000, 17_000])
@@ -239,11 +214,3 @@ def test_more_entries_than_int32_counts_never_overrun(count: int, device: torch.
     assert int(tiles.ends[-1]) == LARGEST_INT > len(tiles.surfel_ids) == 1000  # so the walk goes over all surfels
     assert len(tiles.entries) == 0
     assert ((tiles.surfel_ids >= 0) & (tiles.surfel_ids < count)).all()
-
-
-def test_the_largest_number_of_entries() -> None:
-    assert check_entries(MAX_ENTRIES, 1, 1) == MAX_ENTRIES and 2 * MAX_ENTRIES <= LARGEST_INT
-    with pytest.raises(ValueError, match="got 1,073,741,824, of 3 surfels"):
-        check_entries(MAX_ENTRIES + 1, 3, 5)
-    with pytest.raises(ValueError, match="got 2,147,483,647 or more, of 3 surfels"):
-        check_entries(LARGEST_INT, 3, 5)

@@ -9,9 +9,8 @@ import torch
 import nexwarp as nw
 from nexwarp import ops
 from nexwarp.machine import deterministic
-from nexwarp.native.fused_texture import FEATURES, OUTPUTS, logical_feature, logical_output
+from nexwarp.native.fused_texture import FEATURES
 from nexwarp.ops import fused_texture
-from nexwarp.ops._interop import graph_is_kept
 from tests.reference import hashgrid, sh
 from tests.tolerances import assert_close
 
@@ -127,29 +126,6 @@ def test_gradients_may_overwrite_the_features() -> None:
         assert torch.equal(one, other), name
 
 
-def test_a_backward_pass_knows_whether_it_may_be_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Torch tells whether the graph is kept; a torch that cannot tell counts as keeping it."""
-    told: list[bool] = []
-
-    class Ask(torch.autograd.Function):
-        @staticmethod
-        def forward(ctx: torch.autograd.function.FunctionCtx, x: torch.Tensor) -> torch.Tensor:
-            return x.clone()
-
-        @staticmethod
-        def backward(ctx: torch.autograd.function.FunctionCtx, grad: torch.Tensor) -> torch.Tensor:
-            told.append(graph_is_kept())
-            return grad
-
-    x = torch.ones(1, requires_grad=True)
-    y = Ask.apply(x).sum()
-    for keep in (True, False):
-        y.backward(retain_graph=keep)
-    monkeypatch.delattr(torch._C._autograd, "_get_current_graph_task_keep_graph", raising=False)
-    Ask.apply(x).sum().backward()
-    assert told == [True, False, True] or (torch.__version__ < "2.5" and told == [True] * 3)
-
-
 def test_levels_launched_apart_give_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
     case = make_case(torch.device("cpu"), 4, 3, False, (19, 5, 2))
     together = fused_on_cpu(case)[1]
@@ -224,12 +200,6 @@ def test_values_that_are_not_finite_are_passed_on() -> None:
     assert all(not gradient.isfinite().all() for gradient in gradients)
 
 
-def test_permutations_are_one_to_one() -> None:
-    for features in (2, 4):
-        assert sorted(logical_feature(c, features) for c in range(FEATURES)) == list(range(FEATURES))
-    assert sorted(logical_output(c) for c in range(OUTPUTS)) == list(range(OUTPUTS))
-
-
 @pytest.mark.parametrize(
     ("shape", "usual"),
     [
@@ -250,16 +220,3 @@ def test_shapes_that_the_kernels_take(shape: dict[str, int], usual: bool) -> Non
     texture = nw.NeuralTexture(table_size=2**4, **sizes)
     assert fused_texture.fits(texture.grid, list(texture.mlp.parameters()), 1000) == usual
     assert not fused_texture.fits(texture.grid, list(texture.mlp.parameters()), 2**27)
-
-
-@pytest.mark.parametrize(
-    ("levels", "level_bytes", "groups"),
-    [
-        (8, 2**24, [(0, 4), (4, 5), (5, 6), (6, 7), (7, 8)]),
-        (16, 2**23, [(0, 8), (8, 10), (10, 12), (12, 14), (14, 16)]),
-        (8, 2**19, [(0, 8)]),
-        (1, 2**30, [(0, 1)]),
-    ],
-)
-def test_levels_of_one_launch(levels: int, level_bytes: int, groups: list[tuple[int, int]]) -> None:
-    assert fused_texture.level_groups(levels, level_bytes) == groups

@@ -15,7 +15,16 @@ from tests.render_support import (
     reference_render,
     twin,
 )
-from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, multiply, random_scene, rigid
+from tests.scenes import (
+    SURFEL_KEYS,
+    Scene,
+    layered_scene,
+    make_camera,
+    make_surfels,
+    make_texture,
+    moved_scene,
+    random_scene,
+)
 from tests.tolerances import assert_close, assert_finite, assert_same_ids
 
 
@@ -23,18 +32,14 @@ def test_repeated_renders_are_identical(device: torch.device) -> None:
     scene, texture = random_scene(device=device), make_texture(device=device)
     first = draw(scene, texture)
     for _ in range(3):
-        again = draw(scene, texture)
-        assert_same(again, first, (*BUFFERS, "ids"))
+        assert_same(draw(scene, texture), first, (*BUFFERS, "ids"))
 
 
 def test_the_order_of_the_surfels_changes_nothing(device: torch.device) -> None:
     scene, texture = random_scene(device=device), make_texture(device=device)
     permutation = torch.randperm(len(scene["means"])).to(device)
-    shuffled = scene | {
-        key: scene[key][permutation] for key in ("means", "quats", "scales", "opacities", "gammas", "sh")
-    }
-    out = draw(scene, texture)
-    other = draw(shuffled, texture)
+    shuffled = scene | {key: scene[key][permutation] for key in SURFEL_KEYS}
+    out, other = draw(scene, texture), draw(shuffled, texture)
     assert_same(other, out)
     mapped = torch.where(other.ids >= 0, permutation[other.ids.clamp_min(0).long()], -1)
     assert torch.equal(mapped, out.ids.long())
@@ -42,14 +47,7 @@ def test_the_order_of_the_surfels_changes_nothing(device: torch.device) -> None:
 
 def test_moving_scene_and_camera_together_changes_nothing(device: torch.device) -> None:
     scene = random_scene(sh_degree=0, dtype=torch.float64, device=device)
-    quat = (0.3, -0.7, 0.4, 0.5)
-    motion = rigid(quat, (3.0, -1.0, 2.0)).to(device)
-    turn = torch.tensor([quat], dtype=torch.float64, device=device)
-    moved = scene | {
-        "means": scene["means"] @ motion[:3, :3].T + motion[:3, 3],
-        "quats": multiply(turn, scene["quats"]),
-        "viewmat": scene["viewmat"] @ motion.inverse(),
-    }
+    moved = moved_scene(scene, (0.3, -0.7, 0.4, 0.5), (3.0, -1.0, 2.0))
     assert_alike(draw(moved, max_hits=4), draw(scene, max_hits=4))
 
 
@@ -101,12 +99,6 @@ def test_buffers_follow_their_definition(device: torch.device) -> None:
     assert_close(out.image, out.plain + out.textured + behind, kind="value", name="image")
 
 
-def test_background_may_be_a_tensor(device: torch.device) -> None:
-    scene = random_scene(device=device)
-    out = draw(scene, background=torch.tensor(BACKGROUND, device=device))
-    assert_same(out, draw(scene))
-
-
 @pytest.mark.parametrize("textured", [False, True])
 def test_a_crop_is_a_camera_with_another_centre(textured: bool, device: torch.device) -> None:
     """To the last bit: no result may depend on where a pixel lies in its tile or a tile in the image."""
@@ -133,14 +125,6 @@ def test_no_surfels(max_hits: int, textured: bool, device: torch.device) -> None
     assert (out.ids == -1).all() and not out.alpha.any() and not out.weights.any() and not out.depths.any()
     (out.image.sum() + out.alpha.sum() + out.weights.sum()).backward()
     assert surfels.means.grad is None or surfels.means.grad.shape == (0, 3)
-
-
-def test_one_surfel(device: torch.device) -> None:
-    scene = random_scene(1, device=device)
-    out = draw(scene, max_hits=2)
-    hit = out.ids[..., 0] == 0
-    assert hit.any() and (out.ids[..., 1] == -1).all()
-    assert_close(out.weights[..., 0], out.alpha, kind="value", name="weights")
 
 
 def awkward_scene(device: torch.device, dtype: torch.dtype = torch.float32) -> Scene:
@@ -171,7 +155,8 @@ def test_awkward_surfels_stay_finite(near: float, device: torch.device) -> None:
     out = nw.render(surfels, texture, camera, max_hits=4)
     for name in BUFFERS:
         assert_finite(getattr(out, name), name)
-    loss(out).backward()
+    surface = out.expected_depth.sum() + out.median_depth.sum() + out.top_depth.sum() + out.normals.sum()
+    (loss(out) + surface).backward()
     gradients = {"viewmat": camera.viewmat.grad}
     for module in (surfels, texture):
         gradients |= {name: parameter.grad for name, parameter in module.named_parameters()}

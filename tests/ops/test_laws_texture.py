@@ -77,17 +77,6 @@ def test_jitter_moves_lookups_along_their_rays(
         draw(scene, texture, jitter=torch.ones(2, 3, dtype=factors.dtype, device=device))
 
 
-def test_grid_can_be_written_in_place(device: torch.device) -> None:
-    scene, texture = random_scene(device=device), make_texture(device=device)
-    first = draw(scene, texture).textured
-    with torch.no_grad():
-        texture.grid.neg_()
-    assert not torch.equal(draw(scene, texture).textured, first)
-    with torch.no_grad():
-        texture.grid.neg_()
-    assert torch.equal(draw(scene, texture).textured, first)
-
-
 @pytest.mark.parametrize("sh_degree", [0, 1, 2])
 def test_a_texture_of_lower_degree(sh_degree: int, device: torch.device) -> None:
     scene = random_scene(dtype=torch.float64, device=device)

@@ -1,7 +1,5 @@
 """The order of blending: by distance, what a pixel shows depends on its ray alone, not on where the camera points."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -14,62 +12,28 @@ from nexwarp.io.pictures import to_uint8
 from nexwarp.model import graphs as frames
 from nexwarp.ops.tiles import Order
 from nexwarp.run.render import PictureJob, RenderJob, RenderOrder
-from nexwarp.train.settings import with_settings
 from tests import scenes
 from tests.panorama_support import turned
 from tests.render_support import (
-    BACKGROUND,
     BUFFERS,
-    assert_gradients,
     assert_same,
-    loss,
-    reference_render,
-    rigid_gradient,
-    twin,
+    draw,
 )
-from tests.tolerances import FLIPS, assert_close, assert_same_ids
+from tests.tolerances import assert_close, assert_same_ids
 
 ORDERS: tuple[Order, ...] = ("depth", "distance")
 
 
-def wide_scene(dtype: torch.dtype, device: torch.device | str, count: int = 60) -> scenes.Scene:
-    """A view of 90 degrees, in whose corners z-depth and distance sort surfels differently."""
-    scene = scenes.random_scene(count, seed=4, width=36, height=28, dtype=dtype, device=device)
-    K = scene["K"].clone()
-    K[0, 0] = K[1, 1] = 16.0
-    return scene | {"K": K}
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_rendering_by_distance_agrees_with_the_reference(device, dtype):
-    """Values and gradients, those of the camera included."""
-    scene = wide_scene(dtype, device)
-    surfels, camera = scenes.make_surfels(scene), scenes.make_camera(scene)
-    texture = scenes.make_texture(dtype=dtype, device=device)
-    texture.half_precision = False
-    options: dict[str, Any] = {"max_hits": 2, "background": BACKGROUND, "order": "distance"}
-    out = nw.render(surfels, texture, camera, **options)
-    surfels64, texture64 = twin(surfels), twin(texture)
-    camera64 = scenes.make_camera(scene | {key: scene[key].double().cpu() for key in ("viewmat", "K")})
-    expected = reference_render(surfels64, texture64, camera64, **options)
-    loss(out).backward()
-    loss(expected).backward()
-    flips = 0.0 if dtype == torch.float64 else FLIPS
-    assert_same_ids(out.ids, expected.ids, name="ids", allow_flips=flips)
-    for name in BUFFERS:
-        assert_close(getattr(out, name), getattr(expected, name), kind="value", name=name, allow_flips=flips)
-    assert_gradients(surfels, surfels64, dtype)
-    assert_gradients(texture, texture64, dtype)
-    moved = rigid_gradient(camera.viewmat), rigid_gradient(camera64.viewmat)
-    assert_close(*moved, kind="gradient", name="viewmat", precision=dtype)
-    by_depth = nw.render(surfels, texture, camera, **(options | {"order": "depth"}))
-    assert (by_depth.image - out.image).abs().max() > 0.01
-    assert_same(nw.render(surfels, texture, camera, max_hits=2, background=BACKGROUND), by_depth)
+def test_by_distance_another_surfel_is_in_front():
+    scene = scenes.named_scene("wide", torch.float32, "cpu")
+    by_depth, by_distance = (draw(scene, order=order) for order in ORDERS)
+    assert (by_depth.image - by_distance.image).abs().max() > 0.01
+    assert_same(draw(scene), by_depth)
 
 
 def test_turning_the_camera_changes_no_ray(device):
     """A camera turned by 30 degrees and given the rays of the first one sees what the first one does, by distance."""
-    scene = wide_scene(torch.float64, device)
+    scene = scenes.named_scene("wide", torch.float64, device)
     camera = scenes.make_camera(scene)
     texture = scenes.make_texture(dtype=torch.float64, device=device)
     texture.half_precision = False
@@ -90,7 +54,7 @@ def test_turning_the_camera_changes_no_ray(device):
 
 @pytest.mark.cuda
 def test_captured_frames_keep_their_orders():
-    scene = wide_scene(torch.float32, "cuda")
+    scene = scenes.named_scene("wide", torch.float32, "cuda")
     model, camera = nw.Model(scenes.make_surfels(scene), None), scenes.make_camera(scene)
     with torch.no_grad(), frames.without_graphs():
         expected = {order: model.render(camera, order=order).image for order in ORDERS}
@@ -103,19 +67,17 @@ def test_captured_frames_keep_their_orders():
 
 
 def test_the_order_is_kept_in_files_and_named_where_it_is_bad(tmp_path):
-    surfels = scenes.make_surfels(scenes.random_scene(4))
-    model = nw.Model(surfels, None, options=nw.RenderOptions(order="distance"))
+    scene = scenes.random_scene(4)
+    model = nw.Model(scenes.make_surfels(scene), None, options=nw.RenderOptions(order="distance"))
     assert nw.load(model.save(tmp_path)).options.order == "distance"
-    with pytest.raises(ValueError, match="order: expected depth or distance, got 'near'"):
-        model.options.changed(order="near")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="order: expected depth or distance, got 1"):
-        nw.render(surfels, None, scenes.make_camera(scenes.random_scene(4)), order=1)  # type: ignore[arg-type]
+        nw.render(model.surfels, None, scenes.make_camera(scene), order=1)  # type: ignore[arg-type]
     with pytest.raises(FormatError, match="order: expected depth, which the web page draws, got distance"):
         SceneData.of(model)
 
 
 def test_the_command_renders_by_the_order_asked_for(tmp_path):
-    scene = wide_scene(torch.float32, "cpu")
+    scene = scenes.named_scene("wide", torch.float32, "cpu")
     model, camera = nw.Model(scenes.make_surfels(scene), None), scenes.make_camera(scene)
     camera = nw.Camera(camera.viewmat.detach(), camera.K, camera.width, camera.height, camera.near)
     for order in ORDERS:
@@ -125,7 +87,3 @@ def test_the_command_renders_by_the_order_asked_for(tmp_path):
         assert (np.asarray(Image.open(file)) == expected.numpy()).all()
     with pytest.raises(SettingError, match="--order: expected depth or distance, got 'near'"):
         RenderOrder(set="test", order="near").check()
-    with pytest.raises(SettingError, match="--order: expected together with --camera pinhole, got --camera panorama"):
-        RenderOrder(set="test", order="distance", camera="panorama").check()
-    with pytest.raises(ValueError, match="order: expected depth or distance, got 'near'"):
-        with_settings(nw.Config(), {"order": "near"})

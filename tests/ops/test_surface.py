@@ -7,14 +7,17 @@ import torch
 
 import nexwarp as nw
 from nexwarp import ops
+from tests.reference.collect import Shape
 from tests.reference.surface import surface
+from tests.render_support import view_of
 from tests.scenes import (
     Scene,
     detached_shape,
     layered_scene,
     make_camera,
     make_surfels,
-    multiply,
+    moved_scene,
+    named_scene,
     random_scene,
     rigid,
 )
@@ -54,18 +57,11 @@ def assert_everywhere(buffer: torch.Tensor, value: float | list[float], name: st
 @pytest.mark.parametrize("name", ["random", "layered", "off_centre", "specks"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_surface_agrees_with_the_reference(dtype: torch.dtype, name: str, device: torch.device) -> None:
-    if name == "layered":
-        scene = layered_scene(dtype=dtype, device=device)
-    else:
-        scene = random_scene(seed=1, off_centre=name == "off_centre", dtype=dtype, device=device)
-    if name == "specks":
-        scene["scales"] *= 0.1
+    scene = named_scene(name, dtype, device)
     surfels, camera = make_surfels(scene), make_camera(scene)
     out = nw.render(surfels, None, camera)
-    means, quats, scales, opacities, gammas = (x.double().cpu() for x in detached_shape(surfels))
-    viewmat = camera.viewmat.detach().double().cpu()
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
-    expected = surface(means, quats, scales, opacities, gammas, viewmat, *intrinsics)
+    shape = Shape(*(x.double().cpu() for x in detached_shape(surfels)))
+    expected = surface(shape, camera.viewmat.detach().double().cpu(), view_of(camera))
     assert expected.expected_depth.any() and (name != "specks" or not expected.expected_depth.all())
     flips = 0.0 if dtype == torch.float64 else FLIPS
     for buffer in BUFFERS:
@@ -89,9 +85,7 @@ def test_depths_of_layers_by_hand(device: torch.device) -> None:
     assert_everywhere(out.expected_depth, (0.3 * 2 + 0.42 * 3 + 0.14 * 4) / 0.86, "expected depth")
     assert_everywhere(out.median_depth, 3.0, "median depth")
     assert_everywhere(out.top_depth, 3.0, "top depth")
-
-
-def test_the_median_of_what_is_mostly_transparent_is_the_last_hit(device: torch.device) -> None:
+    # Where it is mostly transparent, the median is the last hit.
     out = draw(facing_quads((2.0, 0.3), (5.0, 0.2), device=device))
     assert_everywhere(out.median_depth, 5.0, "median depth")
     assert_everywhere(out.top_depth, 2.0, "top depth")
@@ -100,17 +94,11 @@ def test_the_median_of_what_is_mostly_transparent_is_the_last_hit(device: torch.
 def test_a_rigid_motion_turns_normals_and_keeps_depths(device: torch.device) -> None:
     scene = random_scene(dtype=torch.float64, device=device)
     quat = (0.3, -0.7, 0.4, 0.5)
-    motion = rigid(quat, (3.0, -1.0, 2.0)).to(device)
-    turn = torch.tensor([quat], dtype=torch.float64, device=device)
-    moved = scene | {
-        "means": scene["means"] @ motion[:3, :3].T + motion[:3, 3],
-        "quats": multiply(turn, scene["quats"]),
-        "viewmat": scene["viewmat"] @ motion.inverse(),
-    }
-    out, expected = draw(moved), draw(scene)
+    out, expected = draw(moved_scene(scene, quat, (3.0, -1.0, 2.0))), draw(scene)
+    turn = rigid(quat, (0.0, 0.0, 0.0)).to(device)[:3, :3]
     for name in DEPTHS:
         assert_close(getattr(out, name), getattr(expected, name), kind="value", name=name)
-    assert_close(out.normals, expected.normals @ motion[:3, :3].T, kind="value", name="normals")
+    assert_close(out.normals, expected.normals @ turn.T, kind="value", name="normals")
 
 
 def test_with_room_for_all_hits_the_buffer_has_the_expected_and_the_top_depth(device: torch.device) -> None:
@@ -143,25 +131,3 @@ def test_normals_are_unit_face_the_camera_and_are_0_where_nothing_is_hit(device:
     camera = make_camera(scene)
     _, rays = ops.unproject(out.depths.detach(), camera.viewmat.detach(), out.intermediates.pinhole)
     assert ((out.normals * rays.view_as(out.normals)).sum(-1) <= 0).all()
-
-
-def test_an_empty_scene_has_no_surface(device: torch.device) -> None:
-    out = draw(random_scene(0, device=device))
-    for name in BUFFERS:
-        assert getattr(out, name).shape[:2] == (18, 23) and not getattr(out, name).any(), name
-
-
-def test_surface_of_short_lists(device: torch.device) -> None:
-    """Where lists lack entries the walk goes over all surfels, and finds the same."""
-    scene = random_scene(60, width=70, height=40, device=device)
-    surfels, camera = make_surfels(scene), make_camera(scene)
-    pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
-    shape = detached_shape(surfels)
-    projection = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat.detach())
-    found = []
-    for room in (None, 3):
-        tiles = ops.intersect_tiles(shape, projection, camera.viewmat.detach(), pinhole, room=room)
-        hits = ops.collect(projection, tiles, pinhole)
-        found.append(ops.surface(projection, tiles, hits, pinhole, camera.viewmat.detach()))
-    for name in BUFFERS:
-        assert torch.equal(getattr(found[0], name), getattr(found[1], name)), name

@@ -11,11 +11,11 @@ import nexwarp as nw
 from nexwarp import ops
 from nexwarp.kernels import launch
 from tests.narrowing import present
-from tests.ops.test_laws import awkward_scene
+from tests.reference.collect import Shape
 from tests.reference.surface import Surface, surface
-from tests.render_support import assert_gradients, rigid_gradient, twin
-from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
-from tests.tolerances import FLIPS, TOLERANCES, assert_close
+from tests.render_support import assert_gradients, rigid_gradient, twin, view_of
+from tests.scenes import layered_scene, make_camera, make_surfels, make_texture, named_scene, random_scene
+from tests.tolerances import FLIPS, assert_close
 
 BUFFERS = ("expected_depth", "median_depth", "top_depth", "normals", "blended_normals")
 GEOMETRY = ("means", "quats", "scales", "opacities", "gammas")
@@ -23,9 +23,7 @@ GEOMETRY = ("means", "quats", "scales", "opacities", "gammas")
 
 def reference(tensors: dict[str, torch.Tensor], camera: nw.Camera) -> Surface:
     """Hand tensors in float64 on the CPU to the reference."""
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.near)
-    means, quats, scales, opacities, gammas, viewmat = (tensors[name] for name in (*GEOMETRY, "viewmat"))
-    return surface(means, quats, scales, opacities, gammas, viewmat, *intrinsics)
+    return surface(Shape(*(tensors[name] for name in GEOMETRY)), tensors["viewmat"], view_of(camera))
 
 
 def loss(out: Any, buffers: tuple[str, ...] = BUFFERS) -> torch.Tensor:
@@ -38,20 +36,11 @@ def loss(out: Any, buffers: tuple[str, ...] = BUFFERS) -> torch.Tensor:
     return total
 
 
-def make_scene(name: str, dtype: torch.dtype, device: torch.device) -> Scene:
-    if name == "layered":
-        return layered_scene(dtype=dtype, device=device)
-    scene = random_scene(seed=1, off_centre=name == "off_centre", dtype=dtype, device=device)
-    if name == "specks":
-        scene["scales"] *= 0.1
-    return scene
-
-
 @pytest.mark.parametrize("name", ["random", "layered", "off_centre", "specks"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_gradients_agree_with_the_reference(dtype: torch.dtype, name: str, device: torch.device) -> None:
     """With respect to every parameter and the camera; of the random scene in float64 for each buffer by itself, too."""
-    scene = make_scene(name, dtype, device)
+    scene = named_scene(name, dtype, device)
     surfels, camera = make_surfels(scene), make_camera(scene)
     expected, viewmat = twin(surfels), camera.viewmat.detach().double().cpu().requires_grad_()
     tensors = {key: getattr(expected, key) for key in GEOMETRY} | {"viewmat": viewmat}
@@ -82,34 +71,6 @@ def test_gradients_of_the_reference_agree_with_differences() -> None:
     assert torch.autograd.gradcheck(buffers, inputs, fast_mode=True)
 
 
-def test_gradients_agree_with_differences(device: torch.device) -> None:
-    """Of the rendering itself, with respect to the raw parameters."""
-    scene = random_scene(8, seed=3, width=9, height=8, dtype=torch.float64, device=device)
-    surfels, camera = make_surfels(scene), make_camera(scene)
-    named = [(name, x) for name, x in surfels.named_parameters() if not name.startswith("sh")]
-
-    def buffers(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        given = dict(zip((name for name, _ in named), tensors, strict=True))
-        out = torch.func.functional_call(_Drawn(surfels, camera), {f"surfels.{k}": x for k, x in given.items()})
-        return tuple(out)
-
-    # Sums are in no fixed order on a GPU, so that two backward passes differ by roundings.
-    nondet_tol = TOLERANCES[torch.float64]["gradient"] if device.type == "cuda" else 0.0
-    assert torch.autograd.gradcheck(buffers, [x for _, x in named], fast_mode=True, nondet_tol=nondet_tol)
-
-
-class _Drawn(torch.nn.Module):
-    """Renders surfels whose parameters can be replaced; returns the buffers."""
-
-    def __init__(self, surfels: nw.Surfels, camera: nw.Camera) -> None:
-        super().__init__()
-        self.surfels, self.camera = surfels, camera
-
-    def forward(self) -> list[torch.Tensor]:
-        out = nw.render(self.surfels, None, self.camera)
-        return [getattr(out, name) for name in BUFFERS]
-
-
 def test_the_median_and_the_top_depth_follow_the_hit_that_they_are_taken_from(device: torch.device) -> None:
     """A sheet across the view: moved along its normal by h, its depth changes by h; no other sheet has a gradient."""
     scene = layered_scene(dtype=torch.float64, device=device)
@@ -126,41 +87,6 @@ def test_the_median_and_the_top_depth_follow_the_hit_that_they_are_taken_from(de
         assert not any(present(x.grad).any() for name, x in grads.items() if "opacities" in name or "gammas" in name)
         found.append(int(moved))
     assert found[1] == int(out.ids[9, 11, 0])
-
-
-def test_awkward_surfels_have_finite_gradients(device: torch.device) -> None:
-    """Behind, at, around and across the camera, edge-on, enormous and tiny."""
-    scene = awkward_scene(device)
-    surfels, camera = make_surfels(scene), make_camera(scene)
-    loss(nw.render(surfels, None, camera)).backward()
-    for name, x in surfels.named_parameters():
-        assert x.grad is None or x.grad.isfinite().all(), name
-    assert present(camera.viewmat.grad).isfinite().all()
-
-
-def test_gradients_add_to_those_of_the_image(device: torch.device) -> None:
-    """One backward pass of a sum gives the sum of the gradients."""
-    scene = random_scene(dtype=torch.float64, device=device)
-    parts: list[list[torch.Tensor]] = []
-    for image, depth in ((1.0, 0.0), (0.0, 1.0), (1.0, 1.0)):
-        surfels = make_surfels(scene)
-        out = nw.render(surfels, None, make_camera(scene))
-        (image * out.image.square().sum() + depth * loss(out)).backward()
-        parts.append([present(x.grad) for x in surfels.parameters()])
-    for a, b, both in zip(*parts, strict=True):
-        assert_close(both, a + b, kind="gradient", name="sum")
-
-
-def test_the_first_use_may_be_without_gradients(device: torch.device) -> None:
-    """What is kept for later uses has the gradients of the rendering, whoever asked first."""
-    scene = random_scene(dtype=torch.float64, device=device)
-    out = nw.render(make_surfels(scene), None, make_camera(scene))
-    with torch.no_grad():
-        assert out.median_depth.any()
-    assert all(getattr(out, name).requires_grad for name in BUFFERS)
-    with torch.no_grad():
-        out = nw.render(make_surfels(scene), None, make_camera(scene))
-    assert not any(getattr(out, name).requires_grad for name in BUFFERS)
 
 
 def test_a_rendering_walks_once_until_a_surface_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,19 +108,6 @@ def test_a_rendering_walks_once_until_a_surface_is_asked_for(monkeypatch: pytest
     assert not launched
     (out.normals.sum() + out.expected_depth.sum()).backward()
     assert len(launched) == 2
-
-
-def test_sums_in_fixed_point_are_those_of_floats(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = random_scene(150, seed=3, width=61, height=45)
-    results = []
-    for fixed in (False, True):
-        module = importlib.import_module("nexwarp.ops.collect")
-        monkeypatch.setattr(module, "sums_in_fixed_point", lambda like, fixed=fixed: fixed)
-        surfels = make_surfels(scene)
-        loss(nw.render(surfels, None, make_camera(scene))).backward()
-        results.append({name: present(x.grad) for name, x in surfels.named_parameters() if x.grad is not None})
-    for name, plain in results[0].items():
-        assert_close(results[1][name], plain, kind="gradient", name=name)
 
 
 @pytest.mark.cuda

@@ -9,12 +9,10 @@ from torch.autograd import gradcheck
 import nexwarp as nw
 from nexwarp import ops
 from nexwarp.data import Scene as Capture
-from nexwarp.model.render import Rendering
 from nexwarp.train.recipe import Config, LossWeights
 from nexwarp.train.surface_losses import depth_normals, normal_loss, normals_factor
 from nexwarp.train.trainer import Trainer
-from tests.narrowing import present
-from tests.scenes import layered_scene, make_camera, make_surfels, random_scene
+from tests.scenes import make_camera, make_surfels, random_scene
 from tests.tolerances import assert_close
 from tests.trainer_support import small
 
@@ -70,13 +68,6 @@ def test_depth_normals_against_differences(device: torch.device) -> None:
     assert gradcheck(lambda d, v: depth_normals(d, v, camera), inputs)
 
 
-def layers(device: torch.device) -> tuple[nw.Surfels, Rendering]:
-    scene = layered_scene(dtype=torch.float64, device=device)
-    scene["opacities"] *= 0.6
-    surfels = make_surfels(scene)
-    return surfels, nw.render(surfels, None, make_camera(scene))
-
-
 def test_normal_loss_by_its_definition(device: torch.device) -> None:
     """The sum over hits of w (1 - n . N), where the K-buffer has all hits."""
     scene = random_scene(8, dtype=torch.float64, device=device)
@@ -91,28 +82,6 @@ def test_normal_loss_by_its_definition(device: torch.device) -> None:
     assert_close(normal_loss(out), errors.mean(), kind="value", name="loss")
     counts = torch.rand(errors.shape, device=device) > 0.5
     assert_close(normal_loss(out, counts), (errors * counts).mean(), kind="value", name="masked loss")
-
-
-def test_descent_makes_a_loss_smaller_and_masked_pixels_have_no_gradient(device: torch.device) -> None:
-    surfels, out = layers(device)
-    normal_loss(out, torch.zeros_like(out.alpha, dtype=torch.bool)).backward(retain_graph=True)
-    assert not present(surfels.means.grad).any()
-    value = normal_loss(out)
-    value.backward()
-    with torch.no_grad():
-        for name, x in surfels.named_parameters():
-            if x.grad is not None and not name.startswith("sh"):
-                x.add_(x.grad, alpha=-1e-3)
-        moved = nw.render(surfels, None, make_camera(layered_scene(dtype=torch.float64, device=device)))
-    assert normal_loss(moved) < value
-
-
-def test_nothing_of_a_rendering_without_hits(device: torch.device) -> None:
-    scene = random_scene(0, dtype=torch.float64, device=device)
-    surfels = make_surfels(scene)
-    out = nw.render(surfels, None, make_camera(scene))
-    normal_loss(out).backward()
-    assert normal_loss(out) == 0
 
 
 def test_the_loss_starts_as_that_of_2dgs() -> None:

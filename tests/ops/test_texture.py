@@ -2,7 +2,6 @@
 
 import functools
 import math
-import sys
 from typing import Any
 
 import pytest
@@ -54,16 +53,6 @@ def test_textured_colors_agree_with_the_reference(
         assert_close(gradient, reference, kind="gradient", name=f"gradient {index}")
 
 
-def test_points_evaluated_in_parts_have_the_same_colors(monkeypatch: pytest.MonkeyPatch) -> None:
-    texture = nw.NeuralTexture(4, 2**8, 2, 1.0, 6.0)
-    positions, depths = torch.rand(37, 2, 3), torch.ones(37, 2)
-    directions = torch.nn.functional.normalize(torch.rand(37, 3), dim=-1)
-    with torch.no_grad():
-        whole = texture.colors(positions, depths, directions, 24.0)
-        monkeypatch.setattr(sys.modules["nexwarp.ops.texture"], "PART", 16)
-        assert_close(texture.colors(positions, depths, directions, 24.0), whole, kind="value", name="colors")
-
-
 @pytest.mark.parametrize("part", ["grid", "hidden", "last"])
 def test_what_is_not_a_number_reaches_the_colors(part: str) -> None:
     """And its gradients: ReLU must not hide that a training has diverged."""
@@ -75,11 +64,3 @@ def test_what_is_not_a_number_reaches_the_colors(part: str) -> None:
     assert colors.isnan().all()
     grads = torch.autograd.grad(colors.sum(), [texture.grid, hidden[0]])
     assert any(grad.isnan().any() for grad in grads)
-
-
-def test_an_mlp_that_does_not_fit_its_grid_is_refused() -> None:
-    for wrong in (torch.nn.Linear(8, 48, bias=False), torch.nn.Linear(4, 47, bias=False)):
-        texture = nw.NeuralTexture(2, 2**4, 2, 1.0, 2.0, hidden_layers=0)
-        texture.mlp = torch.nn.Sequential(wrong)
-        with pytest.raises((RuntimeError, ValueError)):
-            texture.colors(torch.rand(5, 2, 3), torch.ones(5, 2), torch.tensor([[0.0, 0.0, 1.0]] * 5), 24.0)

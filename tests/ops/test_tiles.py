@@ -1,7 +1,6 @@
 """Tile lists: what is listed, in which order, and what happens when there is no room for all of it."""
 
 import itertools
-from collections.abc import Iterator
 
 import pytest
 import torch
@@ -11,15 +10,6 @@ from nexwarp import ops
 from nexwarp.kernels import launch
 from tests.scenes import CAMERA_KEYS, SURFEL_KEYS, Scene, random_scene
 from tests.tolerances import assert_close
-
-
-@pytest.fixture
-def one_thread() -> Iterator[None]:
-    """Without room, a CPU's gradients go straight to surfels: atomics are none there, so only one thread may run."""
-    threads = launch.get_num_threads()
-    launch.set_num_threads(1)
-    yield
-    launch.set_num_threads(threads)
 
 
 def passes(scene: Scene, room: int | None) -> tuple[ops.Tiles, ops.Hits, list[torch.Tensor]]:
@@ -35,9 +25,11 @@ def passes(scene: Scene, room: int | None) -> tuple[ops.Tiles, ops.Hits, list[to
     return tiles, hits, list(torch.autograd.grad(total, list(surfels.parameters()), allow_unused=True))
 
 
-@pytest.mark.usefixtures("one_thread")
+@pytest.mark.usefixtures("restore_launch_threads")
 @pytest.mark.parametrize("room", [0, 3, 10_000])
 def test_too_little_or_too_much_room_changes_nothing(room: int, device: torch.device) -> None:
+    # Without room, a CPU's gradients go straight to surfels: atomics are none there, so only one thread may run.
+    launch.set_num_threads(1)
     scene = random_scene(60, width=70, height=40, device=device)
     tiles, hits, gradients = passes(scene, None)
     other_tiles, other_hits, other_gradients = passes(scene, room)

@@ -1,12 +1,36 @@
 """The collection pass (paper Sec. 4.2): blend the plain colours, keep the K heaviest hits of each pixel."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 
 ALPHA_MAX = 0.99
 ALPHA_MIN = 1 / 255
 TRANSMITTANCE_MIN = 1e-4
+
+
+class Shape(NamedTuple):
+    """Surfels: (N, 3) in the world, (N, 4) wxyz surfel to world, (N, 2), (N,), (N, 2)."""
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    gammas: torch.Tensor
+
+
+class View(NamedTuple):
+    """Intrinsics and size in pixels; hits count beyond the z-depth `near`, in order of their centres' `order`."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    near: float
+    order: str = "depth"  # or "distance"
 
 
 @dataclass(frozen=True)
@@ -66,8 +90,7 @@ def rotations(quats: torch.Tensor) -> torch.Tensor:
 
 def pixel_centers(width: int, height: int, like: torch.Tensor) -> torch.Tensor:
     """Pixel coordinates (H * W, 2) of the pixel centres, row by row."""
-    x = torch.arange(width, dtype=like.dtype, device=like.device) + 0.5
-    y = torch.arange(height, dtype=like.dtype, device=like.device) + 0.5
+    x, y = (torch.arange(size, dtype=like.dtype, device=like.device) + 0.5 for size in (width, height))
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
 
 
@@ -75,6 +98,11 @@ def camera_rays(pixels: torch.Tensor, fx: float, fy: float, cx: float, cy: float
     """Camera-frame directions (P, 3) with z = 1 through `pixels` (P, 2)."""
     x, y = pixels.unbind(-1)
     return torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], dim=-1)
+
+
+def rays_of(view: View, like: torch.Tensor) -> torch.Tensor:
+    """Camera-frame directions (H * W, 3) with z = 1 through the pixel centres."""
+    return camera_rays(pixel_centers(view.width, view.height, like), view.fx, view.fy, view.cx, view.cy)
 
 
 def power(u: torch.Tensor, gamma: torch.Tensor) -> torch.Tensor:
@@ -103,47 +131,9 @@ def intersect(
     return u, v, t, meets
 
 
-def collect(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    gammas: torch.Tensor,
-    colors: torch.Tensor,
-    viewmat: torch.Tensor,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
-    near: float,
-    max_hits: int,
-    order: str = "depth",
-) -> Hits:
-    """Blend every pixel; differentiable with respect to every float tensor.
-
-    Args:
-        means: (N, 3), world frame.
-        quats: (N, 4), surfel to world, wxyz.
-        scales: (N, 2).
-        opacities: (N,).
-        gammas: (N, 2).
-        colors: (N, 3), plain colours.
-        viewmat: (4, 4), world to camera.
-        fx: focal length along x in pixels.
-        fy: focal length along y in pixels.
-        cx: x of the principal point in pixels.
-        cy: y of the principal point in pixels.
-        width: of the image in pixels.
-        height: of the image in pixels.
-        near: hits count beyond this z-depth.
-        max_hits: K.
-        order: "depth" or "distance" of the surfels' centres, which sorts them.
-    """
-    walked = walk(
-        means, quats, scales, opacities, gammas, viewmat, fx, fy, cx, cy, width, height, near, order
-    )  # fmt: skip
+def collect(shape: Shape, colors: torch.Tensor, viewmat: torch.Tensor, view: View, max_hits: int) -> Hits:
+    """Blend plain colours (N, 3) in every pixel of a camera (4, 4), world to camera; differentiable in every tensor."""
+    walked = walk(shape, viewmat, view)
     ranked, t, alphas = walked.order, walked.t, walked.alphas
     weights = alphas * walked.before
     alpha = 1 - torch.prod(1 - alphas, dim=-1)
@@ -158,49 +148,33 @@ def collect(
     def slots(values: torch.Tensor, empty: float) -> torch.Tensor:
         values = torch.where(filled, values, empty)
         values = torch.nn.functional.pad(values, (0, max_hits - values.shape[-1]), value=empty)
-        return values.reshape(height, width, max_hits)
+        return values.reshape(view.height, view.width, max_hits)
 
     return Hits(
-        plain=plain.reshape(height, width, 3),
-        base=base.reshape(height, width, 3),
+        plain=plain.reshape(view.height, view.width, 3),
+        base=base.reshape(view.height, view.width, 3),
         ids=slots(ranked[heaviest], -1),
         depths=slots(t.gather(-1, heaviest), 0.0),
         weights=slots(weights.gather(-1, heaviest), 0.0),
-        alpha=alpha.reshape(height, width),
+        alpha=alpha.reshape(view.height, view.width),
     )
 
 
-def walk(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    gammas: torch.Tensor,
-    viewmat: torch.Tensor,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
-    near: float,
-    order: str = "depth",
-) -> Walk:
-    """Meet every pixel's ray with every surfel; arguments as of `collect`."""
+def walk(shape: Shape, viewmat: torch.Tensor, view: View) -> Walk:
+    """Meet every pixel's ray with every surfel."""
+    means, quats, scales, opacities, gammas = shape
     rotation = viewmat[:3, :3]
     centers = means @ rotation.T + viewmat[:3, 3]
-    axes = rotation @ rotations(quats)
-    pixels = pixel_centers(width, height, means)
 
     # The hit (paper Eq. 3).
-    u, v, t, meets = intersect(centers, axes, scales, camera_rays(pixels, fx, fy, cx, cy))
+    u, v, t, meets = intersect(centers, rotation @ rotations(quats), scales, rays_of(view, means))
     exponent = power(u, gammas[:, 0]) + power(v, gammas[:, 1])
     alphas = (opacities * torch.exp(-exponent / 2)).clamp_max(ALPHA_MAX)
-    counts = meets & (alphas >= ALPHA_MIN) & (t > near)
+    counts = meets & (alphas >= ALPHA_MIN) & (t > view.near)
     alphas = torch.where(counts, alphas, 0.0)
 
     # Front to back: transmittance before each hit, up to and including the hit that makes the pixel opaque.
-    keys = centers.norm(dim=-1) if order == "distance" else centers[:, 2]
+    keys = centers.norm(dim=-1) if view.order == "distance" else centers[:, 2]
     ranked = torch.sort(keys.detach().float(), stable=True).indices
     alphas, t = alphas[:, ranked], t[:, ranked]
     before = transmittance_before(alphas)

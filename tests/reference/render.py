@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
-from tests.reference.collect import camera_rays, collect, pixel_centers
+from tests.reference.collect import Shape, View, collect, rays_of
 from tests.reference.hashgrid import encode
 from tests.reference.sh import evaluate, plain_colors
 
@@ -49,51 +49,37 @@ def field(texture: Texture, positions: torch.Tensor, depths: torch.Tensor, focal
 
 
 def render(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    gammas: torch.Tensor,
+    shape: Shape,
     sh: torch.Tensor,
     texture: Texture | None,
     viewmat: torch.Tensor,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
-    near: float,
+    view: View,
+    *,
     max_hits: int = 2,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     sh_degree: int = 3,
     clamp_texture: bool = False,
     shares: torch.Tensor | None = None,
-    order: str = "depth",
 ) -> Rendering:
     """Render; differentiable with respect to every float tensor, those of `texture` included.
 
-    `order`: "depth" or "distance" of the surfels' centres, which sorts them.
     `shares` (H, W, K), a constant: depth at which each hit's texture is looked up, over the hit's own.
     """
+    means, (height, width) = shape.means, (view.height, view.width)
     rotation = viewmat[:3, :3]
     position = -rotation.T @ viewmat[:3, 3]
     colors = plain_colors(sh, means, position, sh_degree)
-    hits = collect(
-        means, quats, scales, opacities, gammas, colors, viewmat,
-        fx, fy, cx, cy, width, height, near, max_hits, order,
-    )  # fmt: skip
+    hits = collect(shape, colors, viewmat, view, max_hits)
 
     filled = hits.ids >= 0
     texels = torch.zeros(height, width, max_hits, 3, dtype=means.dtype, device=means.device)
     if texture is None:
         texels = texels.index_put((filled,), colors[hits.ids[filled]])
     else:
-        rays = camera_rays(pixel_centers(width, height, means), fx, fy, cx, cy) @ rotation
-        rays = rays.reshape(height, width, 1, 3).expand(-1, -1, max_hits, -1)[filled]
+        rays = (rays_of(view, means) @ rotation).reshape(height, width, 1, 3).expand(-1, -1, max_hits, -1)[filled]
         depths = hits.depths[filled]
         looked_up = depths if shares is None else depths * shares[filled]
-        coefficients = field(texture, position + looked_up[:, None] * rays, depths, (fx * fy) ** 0.5)
+        coefficients = field(texture, position + looked_up[:, None] * rays, depths, (view.fx * view.fy) ** 0.5)
         directions = rays / rays.norm(dim=-1, keepdim=True)
         values = evaluate(coefficients, directions, sh_degree)
         values = values + (colors[hits.ids[filled]] if texture.residual else 0.5)

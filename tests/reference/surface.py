@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from tests.reference.collect import camera_rays, pixel_centers, rotations, walk
+from tests.reference.collect import Shape, View, rays_of, rotations, walk
 
 
 @dataclass(frozen=True)
@@ -26,25 +26,8 @@ class Surface:
     blended_normals: torch.Tensor
 
 
-def surface(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    gammas: torch.Tensor,
-    viewmat: torch.Tensor,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
-    near: float,
-) -> Surface:
-    """Give the depths and normals; arguments as of `tests.reference.collect.collect`."""
-    walked = walk(
-        means, quats, scales, opacities, gammas, viewmat, fx, fy, cx, cy, width, height, near
-    )  # fmt: skip
+def surface(shape: Shape, viewmat: torch.Tensor, view: View) -> Surface:
+    walked = walk(shape, viewmat, view)
     t, weights = walked.t, walked.alphas * walked.before
     hit = weights > 0
     total = weights.sum(dim=-1)
@@ -61,16 +44,17 @@ def surface(
         padded = torch.nn.functional.pad(t, (1, 1))
         return torch.where(found, padded.gather(1, places[:, None])[:, 0], 0.0)
 
-    rays = camera_rays(pixel_centers(width, height, means), fx, fy, cx, cy) @ viewmat[:3, :3]
-    normals = rotations(quats)[walked.order][:, :, 2]
+    rays = rays_of(view, shape.means) @ viewmat[:3, :3]
+    normals = rotations(shape.quats)[walked.order][:, :, 2]
     facing = torch.where(rays @ normals.T > 0, -1.0, 1.0)
     mean = (weights * facing) @ normals
+    size = view.height, view.width
     return Surface(
-        expected_depth=expected.reshape(height, width),
-        median_depth=depth_at(median_place, median_place > 0).reshape(height, width),
-        top_depth=depth_at(top_place, total > 0).reshape(height, width),
-        normals=torch.nn.functional.normalize(mean, dim=-1).reshape(height, width, 3),
-        blended_normals=mean.reshape(height, width, 3),
+        expected_depth=expected.reshape(size),
+        median_depth=depth_at(median_place, median_place > 0).reshape(size),
+        top_depth=depth_at(top_place, total > 0).reshape(size),
+        normals=torch.nn.functional.normalize(mean, dim=-1).reshape(*size, 3),
+        blended_normals=mean.reshape(*size, 3),
     )
 
 

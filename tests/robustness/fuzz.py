@@ -29,6 +29,7 @@ from typing import Any
 import psutil
 import warp as wp
 
+from nexwarp.kernels import launch
 from tests.robustness.fuzz_inputs import Files, damage
 from tests.robustness.fuzz_targets import TARGETS, FuzzTarget
 
@@ -43,12 +44,11 @@ NO_MEMORY = ("can't allocate", "bad_alloc", "not enough memory", "Unable to allo
 
 @dataclass(frozen=True)
 class Failure:
-    """An input on which a reader failed: how, and where it is saved."""
+    """How a reader failed on an input, and where that is saved."""
 
-    target: str
-    index: int
     kind: str
     detail: str
+    index: int = 0
     folder: Path | None = None
 
 
@@ -63,7 +63,7 @@ class Result:
 
 
 def judge(read: Callable[[Path], object], folder: Path) -> str | Failure:
-    """Read an input: "loaded", the name of a documented exception, or a failure without its target."""
+    """Read an input: "loaded", the name of a documented exception, or a failure."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -72,12 +72,12 @@ def judge(read: Callable[[Path], object], folder: Path) -> str | Failure:
     except Exception as error:
         text = "".join(traceback.format_exception(error))
         if any(isinstance(e, MemoryError) or any(word in str(e) for word in NO_MEMORY) for e in _causes(error)):
-            return Failure("", 0, "memory", text)
+            return Failure("memory", text)
         if not isinstance(error, DOCUMENTED) and not (isinstance(error, OSError) and str(folder) in str(error)):
-            return Failure("", 0, type(error).__name__, text)
+            return Failure(type(error).__name__, text)
         message = str(error)
         if str(folder) not in message or "\n" in message or not message.isprintable() or len(message) > 2000:
-            return Failure("", 0, "message", text)
+            return Failure("message", text)
         return type(error).__name__
     return "loaded"
 
@@ -132,7 +132,7 @@ class Campaign:
         if process.exitcode == 0:
             return index
         detail = f"longer than {HANG:g} s" if hung else f"exit code {process.exitcode}"
-        failure = Failure(self.target.name, index, "hang" if hung else "crash", detail)
+        failure = Failure("hang" if hung else "crash", detail, index)
         result.inputs += 1
         result.failures.append(self._saved(failure, folder))
         return index + 1
@@ -149,7 +149,7 @@ class Campaign:
         result.refusals += refusals
 
     def _saved(self, failure: Failure, folder: Path) -> Failure:
-        kept = self.failed / f"{failure.target}-{failure.index}-{failure.kind}"
+        kept = self.failed / f"{self.target.name}-{failure.index}-{failure.kind}"
         kept.parent.mkdir(parents=True, exist_ok=True)
         shutil.rmtree(kept, ignore_errors=True)
         if folder.is_dir():
@@ -161,8 +161,7 @@ class Campaign:
 
     def _work(self, valid: list[Files], folder: Path, report: Connection, now: Any, indices: range, end: float) -> None:
         """Body of the forked process; its reports count only inputs that ended."""
-        _silence()
-        _limit_memory()
+        _confine()
         for index in indices:
             rng = random.Random(f"{self.seed}/{self.target.name}/{index}")
             self.target.write(folder, damage(rng, rng.choice(valid), self.target.fuzzed))
@@ -171,7 +170,7 @@ class Campaign:
             if isinstance(outcome, Failure):
                 kept = folder.with_name(f"failed-{index}")
                 shutil.copytree(folder, kept, symlinks=True)
-                report.send((replace(outcome, target=self.target.name, index=index), kept))
+                report.send((replace(outcome, index=index), kept))
                 report.send((1, 0, Counter()))
             else:
                 loaded = outcome == "loaded"
@@ -185,12 +184,7 @@ class Campaign:
 
 
 def _hangs(process: int | None, now: Sequence[float]) -> bool:
-    """Whether a process works on an input for too long.
-
-    Args:
-        process: its id.
-        now: index of the input, and the times at which the process began it: `time.monotonic`, `time.process_time`.
-    """
+    """Whether a process works for too long on an input, begun at the times now[1:], monotonic and of the process."""
     seconds = time.monotonic() - now[1]
     if seconds <= HANG or process is None:
         return False
@@ -201,16 +195,12 @@ def _hangs(process: int | None, now: Sequence[float]) -> bool:
     return used - now[2] > HANG or seconds > ASLEEP * HANG
 
 
-def _silence() -> None:
-    sys.stdout = sys.stderr = open(os.devnull, "w")
+def _confine() -> None:
+    """Print nothing, and take little memory."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
     os.dup2(null, 2)
-
-
-def _limit_memory() -> None:
-    from nexwarp.kernels import launch
-
+    sys.stdout = sys.stderr = open(os.devnull, "w")
     launch.set_num_threads(1)  # each thread would take memory of its own
     if not sys.platform.startswith("linux"):
         return

@@ -8,22 +8,8 @@ from typing import Any
 Files = dict[str, bytes]
 
 INTEGERS = (0, 1, 2, 3, 7, 255, 256, 2**15, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63 - 1, 2**64 - 1)
-FLOATS = (
-    0.0,
-    -0.0,
-    1.0,
-    -1.0,
-    1e-300,
-    1e-30,
-    1e-8,
-    1e8,
-    1e30,
-    3.5e38,
-    1e300,
-    float("inf"),
-    -float("inf"),
-    float("nan"),
-)
+FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-300, 1e-30, 1e-8, 1e8, 1e30, 3.5e38, 1e300, float("inf"), -float("inf"),
+          float("nan"))  # fmt: skip
 WORDS = (b"", b"0", b"-1", b"nan", b"inf", b"-inf", b"1e999", b"1e308", b"99999999999999999999", b"4294967295", b"#",
          b"1e-320", b"\xff\xfe", b"\x00", b"../x", b"/etc/passwd", b"PINHOLE", b"x" * 300, b"0x10", b"1_0",
          b"9" * 5000)  # fmt: skip

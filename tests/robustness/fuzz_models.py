@@ -66,19 +66,14 @@ def some_trainer() -> Trainer:
     generator = torch.Generator().manual_seed(0)
     images = [torch.rand(HEIGHT, WIDTH, 3, generator=generator) for _ in range(VIEWS)]
     scene = Scene.from_tensors(images, some_cameras(), test_every=0)
-    found = Trainer(scene, Config(iterations=4, max_surfels=20, sh_degree=1, texture=TEXTURE), "cpu")
-    found.run(until=2)
-    return found
+    trainer = Trainer(scene, Config(iterations=4, max_surfels=20, sh_degree=1, texture=TEXTURE), "cpu")
+    trainer.run(until=2)
+    return trainer
 
 
 @torch.no_grad()
 def check_rendering(model: Model, camera: Camera | None = None) -> None:
-    """Raise AssertionError unless a small picture of a model is finite, in all that a rendering holds.
-
-    Args:
-        model: the model.
-        camera: the camera, whose picture is reduced to a few pixels; None takes one that sees the surfels.
-    """
+    """Raise AssertionError unless a picture of a few pixels is finite, from the camera or one that sees the surfels."""
     camera = some_cameras()[0] if camera is None else dataclasses.replace(camera, width=4, height=3)
     out = model.render(camera)
     for name in ("image", "alpha", "depths", "expected_depth", "normals"):

@@ -29,7 +29,6 @@ from nexwarp.model.model_file import load, save_model
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
 from nexwarp.run.log import keep_lines
 from nexwarp.train.recipe import Config
-from nexwarp.train.trainer import Trainer
 from tests.robustness.fuzz_inputs import Files
 from tests.robustness.fuzz_models import (
     HEIGHT,
@@ -46,14 +45,7 @@ from tests.robustness.fuzz_models import (
 
 @dataclass(frozen=True)
 class FuzzTarget:
-    """A reader.
-
-    Attributes:
-        name: of the reader.
-        make: writes valid inputs below a folder and returns them.
-        read: loads the input in a folder.
-        fuzzed: suffixes of the files to damage; other files stay as they are.
-    """
+    """A reader of the input in a folder; `make` writes valid inputs, whose files with the ends `fuzzed` are damaged."""
 
     name: str
     make: Callable[[Path], list[Files]]
@@ -200,10 +192,7 @@ def _checkpoint(folder: Path) -> list[Files]:
     return [_files(folder)]
 
 
-@functools.cache
-def _trainer() -> Trainer:
-    """Return the trainer that restores checkpoints; to make one takes seconds."""
-    return some_trainer()
+_trainer = functools.cache(some_trainer)  # which takes seconds
 
 
 def _read_checkpoint(folder: Path) -> None:
@@ -328,10 +317,6 @@ def _photo_files(folder: Path) -> list[Files]:
     return [{"a.jpg": data} for data in _files(folder).values()]
 
 
-def _read_photo_files(folder: Path) -> None:
-    camera_groups(folder, read_photos(folder, ["a.jpg"], lambda _: None), "auto")
-
-
 def _exr(folder: Path) -> list[Files]:
     rng = np.random.default_rng(0)
     color = torch.from_numpy(rng.random((HEIGHT, WIDTH, 3), np.float32))
@@ -340,17 +325,13 @@ def _exr(folder: Path) -> list[Files]:
     return [_files(folder / "a"), _files(folder / "b")]
 
 
-def _masked_scene(folder: Path) -> object:
-    return load_scene(folder, background="white")
-
-
 TARGETS = {
     target.name: target
     for target in (
         FuzzTarget("colmap_binary", _colmap(False), load_scene, (".bin",)),
         FuzzTarget("colmap_text", _colmap(True), load_scene, (".txt",)),
         FuzzTarget("nerfstudio", _nerfstudio, load_scene, ("transforms.json",)),
-        FuzzTarget("blender", _blender, _masked_scene, (".json",)),
+        FuzzTarget("blender", _blender, lambda folder: load_scene(folder, background="white"), (".json",)),
         FuzzTarget("model", _model, _read_model, (".safetensors",)),
         FuzzTarget("config", _config, read_run, (".json",)),
         FuzzTarget("cameras", _run_cameras, _read_cameras, (".json",)),
@@ -360,7 +341,12 @@ TARGETS = {
         FuzzTarget("camera_path", _camera_path, _read_camera_path, (".json",)),
         FuzzTarget("ply", _ply, lambda folder: read_ply(folder / "points.ply"), (".ply",)),
         FuzzTarget("masks", _images, _read_images, ("mask",)),
-        FuzzTarget("photos", _photo_files, _read_photo_files, (".jpg",)),
+        FuzzTarget(
+            "photos",
+            _photo_files,
+            lambda folder: camera_groups(folder, read_photos(folder, ["a.jpg"], lambda _: None), "auto"),
+            (".jpg",),
+        ),
         FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
     )
 }

@@ -8,11 +8,11 @@ import torch
 import nexwarp as nw
 from nexwarp.model.render import draw, jitter_factors
 from tests.render_support import BACKGROUND, BUFFERS, assert_gradients, loss, reference_render, rigid_gradient, twin
-from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
+from tests.scenes import make_camera, make_surfels, make_texture, named_scene, random_scene
 from tests.tolerances import FLIPS, assert_close, assert_same_ids
 
 CASES = [
-    # scene, textured (True, False or "residual"), max_hits, sh_degree, clamp_texture
+    # scene ("wide" is rendered by distance), textured (True, False or "residual"), max_hits, sh_degree, clamp_texture
     ("random", True, 2, 3, False),
     ("random", True, 1, 1, True),
     ("random", True, 4, 2, True),
@@ -28,16 +28,8 @@ CASES = [
     ("layered", "residual", 8, 1, False),
     ("off_centre", "residual", 1, 2, False),
     ("random", "residual", 0, 3, False),
+    ("wide", True, 2, 3, False),
 ]
-
-
-def make_scene(name: str, dtype: torch.dtype, device: torch.device) -> Scene:
-    if name == "layered":
-        return layered_scene(dtype=dtype, device=device)
-    scene = random_scene(seed=1, off_centre=name == "off_centre", dtype=dtype, device=device)
-    if name == "specks":
-        scene["scales"] *= 0.1
-    return scene
 
 
 @pytest.mark.parametrize("row", [torch.float64, torch.float32, torch.float16])
@@ -60,7 +52,7 @@ def test_render_agrees_with_the_reference(
     if half and (device.type == "cpu" or not textured):
         pytest.skip("half precision is for textures on CUDA")
     dtype = torch.float32 if half else row
-    scene = make_scene(name, dtype, device)
+    scene = named_scene(name, dtype, device)
     surfels, camera = make_surfels(scene), make_camera(scene)
     residual = textured == "residual"
     texture = make_texture(dtype=dtype, device=device, residual=residual) if textured else None
@@ -73,6 +65,7 @@ def test_render_agrees_with_the_reference(
         "background": BACKGROUND,
         "sh_degree": sh_degree,
         "clamp_texture": clamp_texture,
+        "order": "distance" if name == "wide" else "depth",
     }
     flips = 0.0 if dtype == torch.float64 else FLIPS
 
@@ -104,18 +97,11 @@ def test_jitter_agrees_with_the_reference(max_hits: int, device: torch.device) -
     """Values and gradients of what was drawn at random: surfels and camera move the points that are looked up."""
     scene, jitter = random_scene(dtype=torch.float64, device=device), 2.0
     surfels, camera, texture = make_surfels(scene), make_camera(scene), make_texture(dtype=torch.float64, device=device)
-    surfels64, camera64, texture64 = (
-        twin(surfels),
-        make_camera(scene | {key: scene[key].cpu() for key in ("viewmat", "K")}),
-        twin(texture),
-    )
+    surfels64, texture64 = twin(surfels), twin(texture)
+    camera64 = make_camera(scene | {key: scene[key].cpu() for key in ("viewmat", "K")})
     options: dict[str, Any] = {"max_hits": max_hits, "background": BACKGROUND}
-    torch.manual_seed(3)
-    drawn = torch.randn(camera.height, camera.width, max_hits, dtype=torch.float64, device=device)
-    shares = (1 + drawn * jitter / camera.focal).cpu()
-    expected = reference_render(surfels64, texture64, camera64, shares=shares, **options)
-    torch.manual_seed(3)
     factors = jitter_factors(camera, max_hits, jitter, torch.float64)
+    expected = reference_render(surfels64, texture64, camera64, shares=factors.cpu(), **options)
     out = draw(surfels, texture, camera, nw.RenderOptions(**options), jitter=factors)
     loss(out).backward()
     loss(expected).backward()

@@ -4,12 +4,11 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras
@@ -80,16 +79,12 @@ def one_line(capsys: pytest.CaptureFixture[str], *words: str) -> None:
     assert all(word in err for word in words), err
 
 
-def every_fault(run: Path, command: list[str]) -> Iterator[Disk]:
-    """Disks that fail one request of a command after the other; each is yielded in place of the command's own.
-
-    A full disk fails all that follow, too; a broken one that one alone.
-    """
+def every_fault(run: Path, command: list[str]) -> list[Disk]:
+    """Disks that fail one request of a command after the other: a full one all that follow, too."""
     with failing(Disk(run)) as counted:
         assert cli.main(command) == 0
-    yield from (
-        Disk(run, fatal, number, number == FULL) for fatal in range(len(counted.requests)) for number in (FULL, BROKEN)
-    )
+    places = range(len(counted.requests))
+    return [Disk(run, fatal, number, number == FULL) for fatal in places for number in (FULL, BROKEN)]
 
 
 # Training
@@ -101,7 +96,7 @@ def test_training_survives_every_fault_of_its_disk(trained, scene, tmp_path, cap
     run = tmp_path / "run"
     command = ["train", str(scene), "--run", str(run), *FLAGS]
     disks = every_fault(run, command)
-    count = 0
+    assert len(disks) > 100
     for disk in disks:
         shutil.rmtree(run, ignore_errors=True)
         capsys.readouterr()
@@ -113,7 +108,6 @@ def test_training_survives_every_fault_of_its_disk(trained, scene, tmp_path, cap
         one_line(capsys, os.strerror(disk.number))
         if not run.exists():
             assert disk.fatal < 8, where  # the config
-            count += 1
             continue
         check_whole(run)
         kept = whole_checkpoints(run)
@@ -123,8 +117,6 @@ def test_training_survives_every_fault_of_its_disk(trained, scene, tmp_path, cap
             assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, "--resume"]) == 0, where
             assert (run / "model.safetensors").read_bytes() == expected, where
             check_whole(run)
-        count += 1
-    assert count > 100
 
 
 def test_a_full_disk_still_gets_the_model_when_it_has_room_for_that(scene, tmp_path, capsys):
@@ -141,14 +133,6 @@ def test_a_full_disk_still_gets_the_model_when_it_has_room_for_that(scene, tmp_p
     one_line(capsys, "No space left", "training stops at iteration 2", "the current model is saved", "--resume")
     assert nw.load(run).meta["iteration"] == 2
     assert whole_checkpoints(run) == [1]
-
-
-def test_a_read_only_folder_is_refused_before_training(scene, tmp_path, capsys):
-    run = tmp_path / "run"
-    with failing(Disk(run, 0, errno.EROFS, lasting=True)):
-        assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == 2
-    one_line(capsys, str(run), "Read-only file system")
-    assert not run.exists()
 
 
 # Other commands
@@ -169,7 +153,7 @@ def test_other_commands_survive_every_fault(trained, tmp_path, capsys, arguments
     shutil.copytree(trained, run)
     command = [argument.format(run=run) for argument in arguments]
     before = files(run)
-    disks = list(every_fault(run, command))
+    disks = every_fault(run, command)
     assert len(disks) >= 8
     after = files(run)
     for disk in disks:
@@ -220,36 +204,3 @@ def test_truncated_files_are_refused(trained, tmp_path, name, read: Callable[[Pa
             read(file)
         assert isinstance(caught.value, ValueError) and "\n" not in str(caught.value)
         assert str(caught.value).startswith(str(run)), caught.value
-
-
-@pytest.mark.parametrize("name", ["config.json", "cameras.json", "metrics.json"])
-@pytest.mark.parametrize("content", [b"[" * 200_000, b"\xff\xfe", b"null", b"3", b'"x"', b"[[1, 2]]", b'{"a": 1e999}'])
-def test_json_of_another_shape_is_refused(trained, tmp_path, capsys, name, content):
-    run = Path(shutil.copytree(trained, tmp_path / "run"))
-    (run / name).write_bytes(content)
-    command = {"config.json": "info", "cameras.json": "render", "metrics.json": "info"}[name]
-    flags = ["--device", "cpu"] if command == "render" else []
-    code = cli.main([command, str(run), *flags])
-    err = capsys.readouterr().err
-    if name == "metrics.json" and code == 0:
-        assert content == b'{"a": 1e999}'  # facts that it does not know
-        return
-    assert code == 2 and str(run / name) in err and err.count("\n") == 1, err
-
-
-def test_flipped_bits_of_a_checkpoint_never_pass(trained, tmp_path):
-    """A few hundred places in the tensors, of a real one; test_checkpoint.py flips every byte of a small one."""
-    run = Path(shutil.copytree(trained, tmp_path / "run"))
-    shutil.rmtree(run / "checkpoint.old")
-    generator = torch.Generator().manual_seed(0)
-    for name in ("tensors.safetensors", "state.json"):
-        file = run / "checkpoint" / name
-        content = file.read_bytes()
-        for place in torch.randint(len(content), (150,), generator=generator).tolist():
-            flipped = bytearray(content)
-            flipped[place] ^= 1 << (place % 8)
-            file.write_bytes(flipped)
-            with pytest.raises(NexwarpError, match="expected a whole checkpoint"):
-                load_checkpoint(run)
-        file.write_bytes(content)
-    load_checkpoint(run)

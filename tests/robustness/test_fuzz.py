@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.robustness.fuzz import Campaign
-from tests.robustness.fuzz_inputs import Files, damage
+from tests.robustness.fuzz_inputs import damage
 from tests.robustness.fuzz_targets import TARGETS, FuzzTarget
 
 ROOT = Path(__file__).parents[2]
@@ -82,10 +82,7 @@ def _hang(folder: Path) -> None:
 
 
 def _hoard(folder: Path) -> None:
-    try:
-        np.empty(2 * 10**9, np.uint8)
-    except MemoryError as error:
-        raise ValueError(f"{folder}: too large") from error
+    np.empty(2 * 10**9, np.uint8)
 
 
 def _stumble(folder: Path) -> None:
@@ -96,10 +93,6 @@ def _mumble(folder: Path) -> None:
     raise ValueError(f"{folder}: one line\nand another")
 
 
-def _one(folder: Path) -> list[Files]:
-    return [{"a": b"good"}]
-
-
 @pytest.mark.parametrize(
     ("read", "kind"),
     [(_crash, "crash"), (_hang, "hang"), (_hoard, "memory"), (_stumble, "KeyError"), (_mumble, "message")],
@@ -107,9 +100,11 @@ def _one(folder: Path) -> list[Files]:
 def test_failures_are_noticed_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read, kind: str) -> None:
     if kind == "hang":
         monkeypatch.setattr("tests.robustness.fuzz.HANG", 1.0)
-    result = Campaign(FuzzTarget("one", _one, read, ("a",)), 3, tmp_path).run(seconds=60.0, inputs=1)
+    result = Campaign(FuzzTarget("one", lambda _: [{"a": b"good"}], read, ("a",)), 3, tmp_path).run(
+        seconds=60.0, inputs=1
+    )
     (failure,) = result.failures
-    assert failure.kind == kind and (failure.target, failure.index) == ("one", 0)
+    assert (failure.kind, failure.index) == (kind, 0)
     assert failure.folder is not None and (failure.folder / "failure.txt").is_file()
     assert result.inputs == 1 and result.loaded == 0
 

@@ -50,23 +50,14 @@ CUTS_A_LIFE = 25
 
 @dataclass
 class Promise:
-    """What a run folder must hold after a power cut.
+    """What a run folder must hold after a power cut; None among numbers is none."""
 
-    Attributes:
-        runs: numbers of the runs that it may be; None among them is no run.
-        run: number of the newest run whose config was written.
-        least: iteration of the newest checkpoint of that run whose writing returned; None if there is none.
-        most: iteration of the newest checkpoint that was begun.
-        models: numbers of the runs whose model may be there; None among them is no model.
-        torn: whether the run was being overwritten, and has lost files by that.
-    """
-
-    runs: set[int | None] = field(default_factory=lambda: {None})
-    run: int | None = None
-    least: int | None = None
-    most: int | None = None
-    models: set[int | None] = field(default_factory=lambda: {None})
-    torn: bool = False
+    runs: set[int | None] = field(default_factory=lambda: {None})  # numbers of the runs that it may be
+    run: int | None = None  # the newest run whose config was written
+    least: int | None = None  # iteration of the newest checkpoint of that run whose writing returned
+    most: int | None = None  # iteration of the newest checkpoint that was begun
+    models: set[int | None] = field(default_factory=lambda: {None})  # numbers of the runs whose model may be there
+    torn: bool = False  # the run was being overwritten, and has lost files by that
 
     def after(self, recorder: Recorder, moment: int) -> "Promise":
         """Return the promise after so many operations."""
@@ -80,15 +71,14 @@ class Promise:
         if what == "create":
             self.runs.add(number)
         elif what == "created":
-            self.runs, self.run, self.models = {number}, number, {None}
-            self.least, self.most, self.torn = None, None, False
+            vars(self).update(vars(Promise(runs={number}, run=number)))
         elif what == "save":
             self.most = number
         elif what == "saved":
             self.least = number
         elif what == "write model":
             self.models.add(number)
-        elif what == "wrote model":
+        else:
             self.models = {number}
 
 

@@ -2,17 +2,14 @@
 
 Whatever comes: a finished model stays readable, no foreign file is touched, one command gives the same bytes, and what
 fails says so with an error of ours. Trainings are real ones, of few steps on a tiny scene; kills come at a random call
-of the file system, and some with SIGKILL. `NEXWARP_RUNS=5000 pytest -m slow test_run_machine.py` has 5,000 lives.
+of the file system (test_kills.py has SIGKILL). `NEXWARP_RUNS=5000 pytest -m slow test_run_machine.py` has 5,000 lives.
 """
 
 import dataclasses
 import io
 import os
 import shutil
-import subprocess
-import sys
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +22,6 @@ from hypothesis.stateful import (
     RuleBasedStateMachine,
     initialize,
     invariant,
-    precondition,
     rule,
     run_state_machine_as_test,
 )
@@ -40,12 +36,10 @@ from nexwarp.model.model_file import load
 from nexwarp.run.export import ExportOrder, export_run
 from nexwarp.run.folder import LOCK_FILE, read_run
 from nexwarp.run.opened import open_model
-from nexwarp.train import recipe
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.faults import Killed, kill_at
 from tests.scene_writers import write_demo
-from tests.subprocesses import python_path
 
 SMALL = Config(
     texture=TextureConfig(levels=2, table_size=2**6, width=8),
@@ -56,7 +50,6 @@ SMALL = Config(
     footprints=False,
 )
 RUNS = int(os.environ.get("NEXWARP_RUNS", "1000"))
-SIGKILL_EVERY = 20
 ROOT = Path(__file__).parents[2]
 CHECKPOINT_FILES = [f"checkpoint{age}/{file}" for age in ("", ".old") for file in ("state.json", "tensors.safetensors")]
 DAMAGED = ["config.json", "model.safetensors", "metrics.jsonl", "cameras.json", *CHECKPOINT_FILES]
@@ -77,13 +70,6 @@ def train(scene: Path, run: Path, seed: int | None, flag: str) -> None:
     if not resume:
         command = dataclasses.replace(command, iterations=4, max_surfels=24, seed=seed)
     command(Console(file=io.StringIO()))
-
-
-def main() -> None:
-    """Train with the small preset, in a process of its own that is to be killed."""
-    recipe.PRESETS["default"] = SMALL
-    scene, run, seed, flag = sys.argv[1:]
-    train(Path(scene), Path(run), int(seed), flag)
 
 
 @dataclass
@@ -109,7 +95,6 @@ class RunFolders(RuleBasedStateMachine):
     base: ClassVar[Path]
     scene: ClassVar[Path]
     expected: ClassVar[dict[int, bytes]]
-    sigkills: ClassVar[bool]
 
     def __init__(self) -> None:
         super().__init__()
@@ -139,33 +124,6 @@ class RunFolders(RuleBasedStateMachine):
             with pytest.MonkeyPatch.context() as patch:
                 kill_at(patch, moment)
                 train(self.scene, run, seed, flag)
-
-        self._train(name, seed, flag, work)
-
-    @precondition(lambda self: self.sigkills)
-    @rule(name=names, seed=seeds, flag=flags, seconds=st.floats(0.0, 1.0), rare=st.integers(0, SIGKILL_EVERY - 1))
-    def sigkilled(self, name: str, seed: int, flag: str, seconds: float, rare: int) -> None:
-        if rare != SIGKILL_EVERY - 1:  # a new process takes seconds
-            return
-
-        def work(run: Path) -> None:
-            command = [sys.executable, "-c", "from tests.robustness.test_run_machine import main; main()"]
-            process = subprocess.Popen(
-                [*command, str(self.scene), str(run), str(seed), flag],
-                env=os.environ | python_path(ROOT),
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-            )
-            while process.poll() is None and not (run / LOCK_FILE).exists():
-                time.sleep(0.005)
-            time.sleep(seconds)
-            process.kill()
-            _, said = process.communicate()
-            if process.returncode < 0:
-                raise Killed
-            if process.returncode:
-                assert b"nexwarp.errors." in said, said
-                raise RunError("refused, in a process of its own")
 
         self._train(name, seed, flag, work)
 
@@ -319,17 +277,11 @@ class RunFolders(RuleBasedStateMachine):
 
 def snapshot(folder: Path) -> dict[str, bytes]:
     """Contents of all files; links are not followed."""
-    found = {}
-    for top, folders, files in os.walk(folder):
-        folders[:] = [name for name in folders if not os.path.islink(os.path.join(top, name))]
-        for name in files:
-            path = Path(top) / name
-            found[path.relative_to(folder).as_posix()] = path.read_bytes()
-    return found
+    files = [Path(top) / name for top, _, names in os.walk(folder) for name in names]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def without_aside(files: dict[str, bytes]) -> dict[str, bytes]:
-    """Return files without those that a killed process leaves."""
     return {name: content for name, content in files.items() if not is_aside(name)}
 
 
@@ -353,7 +305,7 @@ def test_random_lives_of_run_folders(tmp_path, monkeypatch, count):
     class Machine(RunFolders):
         pass
 
-    Machine.base, Machine.scene, Machine.expected, Machine.sigkills = tmp_path, scene, expected, count == RUNS
+    Machine.base, Machine.scene, Machine.expected = tmp_path, scene, expected
     run_state_machine_as_test(
         Machine,
         settings=settings(
