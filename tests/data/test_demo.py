@@ -51,7 +51,7 @@ def test_tracks_and_errors_are_those_of_structure_from_motion(scene: Scene) -> N
 
 
 def test_smaller_copies_agree(tmp_path, scene: Scene) -> None:
-    copy = load_scene(write_demo(tmp_path / "copy", width=56, height=42, views=10, points=100))
+    copy = load_scene(write_demo(tmp_path / "copy", width=48, height=36, views=10, points=100))
     assert len(copy.train) + len(copy.test) == 10 and len(copy.points) == 100
     assert copy.test[0].camera.fx == pytest.approx(scene.test[0].camera.fx / 2)
     torch.testing.assert_close(copy.test[0].camera.viewmat, scene.test[0].camera.viewmat)
