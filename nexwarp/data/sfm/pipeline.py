@@ -13,7 +13,6 @@ from statistics import median
 from typing import TYPE_CHECKING
 
 from nexwarp.data.lens import pycolmap_module
-from nexwarp.data.sfm.colmap_scene import move_scene
 from nexwarp.data.sfm.options import EXHAUSTIVE_UP_TO, SfmOptions
 from nexwarp.data.sfm.pairs import exhaustive_pairs, sequential_pairs
 from nexwarp.data.sfm.photos import InputPhoto, camera_groups, camera_model, list_photos, read_photos
@@ -300,7 +299,12 @@ class _Work:
             ),
             lambda: done(sum(len(files) for _, _, files in os.walk(output / "images"))),
         )
-        return move_scene(output, self.folder / "scene")
+        scene = self.folder / "scene"
+        (scene / "sparse").mkdir(parents=True)
+        (output / "images").rename(scene / "images")
+        (output / "sparse").rename(scene / "sparse" / "0")
+        cameras = pycolmap.Reconstruction(str(scene / "sparse" / "0")).cameras.values()
+        return sorted({(camera.width, camera.height) for camera in cameras})
 
 
 def _names(model: "pycolmap.Reconstruction") -> list[str]:
