@@ -51,9 +51,9 @@ def initial_points(
     once.
 
     Args:
-        points: (P, 3) float, world frame.
+        points: (P, 3) float, world frame, finite; at least one.
         colors: (P, 3) uint8 sRGB, or float in [0, 1].
-        count: largest number of points.
+        count: largest number of points, 1 or more.
         track_lengths: (P,) integer, number of photos that a point was triangulated from; 0 if unknown.
         errors: (P,) float, mean reprojection errors in pixels; negative if unknown.
         filter_outliers: drop points seen in fewer than 3 photos or with an error above median + 3 robust
@@ -61,11 +61,7 @@ def initial_points(
 
     Returns:
         min(count, available) points.
-
-    Raises:
-        ValueError: `count` < 1, no points, shapes that do not agree, points that are not finite.
     """
-    _check_arguments(points, colors, count, track_lengths, errors)
     xyz = points.detach().cpu().double().numpy()
     srgb = colors.detach().cpu()
     rgb = (srgb.float() / 255.0 if srgb.dtype == torch.uint8 else srgb.float().clamp(0.0, 1.0)).numpy()
@@ -84,26 +80,6 @@ def initial_points(
         scales=torch.from_numpy(predecessor_scales(means).astype(np.float32)),
         normals=torch.from_numpy(plane_normals(xyz, means).astype(np.float32)),
     )
-
-
-def _check_arguments(
-    points: torch.Tensor,
-    colors: torch.Tensor,
-    count: int,
-    track_lengths: torch.Tensor | None,
-    errors: torch.Tensor | None,
-) -> None:
-    if count < 1:
-        raise ValueError(f"count: expected at least 1, got {count}")
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 1:
-        raise ValueError(f"points: expected shape (P, 3) with P >= 1, got {tuple(points.shape)}")
-    if not bool(torch.isfinite(points).all()):
-        raise ValueError("points: expected finite positions, got NaN or infinite ones")
-    if colors.shape != points.shape:
-        raise ValueError(f"colors: expected shape {tuple(points.shape)}, got {tuple(colors.shape)}")
-    for name, tensor in (("track_lengths", track_lengths), ("errors", errors)):
-        if tensor is not None and tensor.shape != points.shape[:1]:
-            raise ValueError(f"{name}: expected shape ({len(points)},), got {tuple(tensor.shape)}")
 
 
 def inliers(count: int, track_lengths: np.ndarray | None, errors: np.ndarray | None) -> np.ndarray:

@@ -120,17 +120,3 @@ def test_unknown_errors_do_not_count_against_a_point():
     errors = np.where(np.arange(100) % 2 == 0, -1.0, 0.5)
     assert len(inliers(100, None, errors)) == 100
     assert inliers(4, None, np.array([0.5, 0.5, 0.5, np.nan])).tolist() == [0, 1, 2]
-
-
-def test_bad_arguments():
-    points, colors = torch.zeros(4, 3), torch.zeros(4, 3)
-    with pytest.raises(ValueError, match="count: expected at least 1, got 0"):
-        initial_points(points, colors, 0)
-    with pytest.raises(ValueError, match=r"points: expected shape \(P, 3\) with P >= 1, got \(0, 3\)"):
-        initial_points(points[:0], colors[:0], 1)
-    with pytest.raises(ValueError, match=r"colors: expected shape \(4, 3\), got \(3, 3\)"):
-        initial_points(points, colors[:3], 1)
-    with pytest.raises(ValueError, match=r"errors: expected shape \(4,\), got \(3,\)"):
-        initial_points(points, colors, 1, errors=torch.zeros(3))
-    with pytest.raises(ValueError, match="points: expected finite positions"):
-        initial_points(points / 0.0, colors, 1)
