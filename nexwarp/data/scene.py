@@ -184,9 +184,9 @@ def load_scene(
 
     A COLMAP model lies in sparse/0, in sparse or in the folder itself, binary or text. Photos of another size than
     their cameras (images_2, images_4, ...) scale the intrinsics by the ratio of the sizes, an axis at a time.
-    Photos of distorted cameras, of every model that COLMAP knows, are undistorted; a
-    panorama becomes six views. Every camera's near depth is 0.01 of the scene scale. The test views are those that
-    the files name, else every eighth by name. More in docs/scenes.md.
+    Photos of distorted cameras, of every model that COLMAP knows, are undistorted; a panorama becomes six views. Every
+    camera's near depth is 0.01 of the scene scale. The test views are those that the files name, else every eighth by
+    name. More in docs/scenes.md.
 
     Args:
         path: folder of the scene.
