@@ -240,8 +240,8 @@ class FrameGraphs:
         if self.latest is not None and (latest := self.latest()) is not None:
             latest.take_buffers()
         self.latest = None
-        image = captured.replay(frame)
-        if not ops.held(captured.room):
+        image, held = captured.replay(frame)
+        if not held:
             # What was rendered is right, but slow, as the next frame by this graph would be.
             del self.frames[captured.kind]
         return image
@@ -296,8 +296,8 @@ class CapturedFrame:
         # Memory of what is not kept here serves other graphs.
         self.result = result if kind[0] else None
 
-    def replay(self, frame: Frame) -> torch.Tensor:
-        """Render another camera, and return a copy of its image."""
+    def replay(self, frame: Frame) -> tuple[torch.Tensor, bool]:
+        """Render another camera; return a copy of its image, and whether the lists have held all entries so far."""
         camera, background = frame.camera, frame.background
         assert isinstance(camera, Camera)
         with self.graphs.using():
@@ -313,7 +313,7 @@ class CapturedFrame:
                 self.camera.falloff.copy_(falloff)
                 self.lens = lens
             self.graph.replay()
-            return self.image.clone()
+            return self.image.clone(), ops.held(self.room)  # both read the graph's memory
 
 
 class CapturedRendering(Rendering):

@@ -228,14 +228,12 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, int]]:
     captured: list[tuple[bool, int]] = []
 
     class Captured:
-        room = None
-
         def __init__(self, graphs: frames.FrameGraphs, frame: Frame, kind: tuple[Any, ...]) -> None:
-            self.state = frame.state
+            self.state, self.kind = frame.state, kind
             captured.append((kind[0], frame.camera.width))
 
-        def replay(self, frame: Frame) -> torch.Tensor:
-            return torch.zeros(3)
+        def replay(self, frame: Frame) -> tuple[torch.Tensor, bool]:
+            return torch.zeros(3), True
 
     class Stream:
         def __init__(self, device: torch.device) -> None:
@@ -245,7 +243,6 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, int]]:
     monkeypatch.setattr(torch.cuda, "Stream", Stream)
     monkeypatch.setattr(torch.cuda, "Event", object)
     monkeypatch.setattr(torch.cuda, "current_stream", Stream)
-    monkeypatch.setattr(frames.ops, "held", lambda _: True)
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
     monkeypatch.setattr(frames, "_can_capture", lambda *_: True)
     monkeypatch.setattr(frames, "_graphs", weakref.WeakKeyDictionary())
