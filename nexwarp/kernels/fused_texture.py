@@ -1,4 +1,4 @@
-"""Texturing on tensor cores: lookup in the hash grid (paper Eq. 2), MLP and SH in one kernel each way.
+"""Texturing on tensor cores: lookup in the hash grid (paper Eq. 2), MLP and SH in one kernel each way; for CUDA alone.
 
 For L * F = 32 features of F = 2 or 4, two hidden layers of 64, and half-precision tables, matrices and activations,
 summed in float32. A warp takes 16 neighbouring pixels, a tile, and one hit of each at a time: 16 points are the rows
@@ -15,7 +15,7 @@ last matrix.
                      Four warps of a block share the sums of matrix gradients: each holds a fourth of them and reads
                      all four's activations
     fused_scatter    gradients of the grid, by atomics, and of positions and depths; a warp is one unit, two threads a
-                     point. On a CPU atomics are none: one thread launches it whole
+                     point
 """
 
 import functools
@@ -23,14 +23,53 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from nexwarp.native import snippet
 from nexwarp.native.fused_texture import WARPS, backward_text, forward_text
 
 FORWARD_THREADS, BACKWARD_THREADS = 256, 32 * WARPS  # of a block
 # Blocks that a multiprocessor holds at least, for which the compiler limits registers.
 FORWARD_BLOCKS, BACKWARD_BLOCKS = 3, 3
 
-Half, Word = wp.array(dtype=wp.float16), wp.array(dtype=wp.int32)
-Real, Vec3 = wp.array(dtype=wp.float32), wp.array(dtype=wp.vec3)
+Word, Real, Vec3 = wp.array(dtype=wp.int32), wp.array(dtype=wp.float32), wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Fused:
+    """What the three kernels read and write; n points, P directions, n = P * hits."""
+
+    # The image's points: width * height = P, K hits each, tiles of (1 << shift) x (16 >> shift) pixels.
+    width: wp.int32
+    height: wp.int32
+    hits: wp.int32
+    shift: wp.int32
+    positions: Vec3
+    depths: Real
+    directions: Vec3
+    # The field: the grid (L T F), the mask of a slot T - 1, the packed matrices.
+    table: wp.array(dtype=wp.float16)
+    mask: wp.uint32
+    resolutions: Real
+    focal: Real
+    packed: Word
+    offset: wp.float32
+    clamp: wp.int32
+    # Written by the forward pass; empty are `encoded` without a backward pass, and in it `colors` without a clamp.
+    encoded: Word
+    colors: Vec3
+    # The backward pass: gradients in half precision are multiplied by `scale`.
+    scale: Real
+    unscale: Real
+    grad_colors: Vec3
+    grad_encoded: Word
+    grad_matrices: Real
+    first_level: wp.int32
+    end_level: wp.int32
+    grad_table: Real
+    grad_points: wp.array(dtype=wp.vec4)
+
+
+# The fields of `Fused` by their names: copies, since references cost registers.
+FIELDS = "".join(f"    const auto {name} = fused.{name};\n" for name in Fused.vars)
 
 
 @wp.func_native("""
@@ -103,129 +142,25 @@ def order_gradients(
 def fused_kernels(features: int) -> SimpleNamespace:
     """Make the kernels of the forward pass and of the backward pass down to the features, for F = 2 or 4.
 
-    Both take threads = 32 times a number of warps, on a CPU the number of warps, which share out the tiles.
+    Both take threads = 32 times a number of warps, which share out the tiles.
     """
 
-    @wp.func_native(forward_text(features))
-    def forward(  # noqa: PLR0913  # the body of a kernel entry point
-        thread: wp.int32,
-        threads: wp.int32,
-        table: Half,
-        mask: wp.uint32,
-        positions: Vec3,
-        depths: Real,
-        directions: Vec3,
-        resolutions: Real,
-        focal: Real,
-        packed: Word,
-        width: wp.int32,
-        height: wp.int32,
-        hits: wp.int32,
-        shift: wp.int32,
-        offset: wp.float32,
-        clamp: wp.int32,
-        encoded: Word,
-        colors: Vec3,
-    ): ...
+    @wp.func_native(snippet(FIELDS + forward_text(features)))
+    def forward(thread: wp.int32, threads: wp.int32, fused: Fused): ...
 
-    @wp.func_native(backward_text(features))
-    def backward(  # noqa: PLR0913  # the body of a kernel entry point
-        thread: wp.int32,
-        threads: wp.int32,
-        encoded: Word,
-        directions: Vec3,
-        packed: Word,
-        width: wp.int32,
-        height: wp.int32,
-        hits: wp.int32,
-        shift: wp.int32,
-        scale: Real,
-        colors: Vec3,
-        grad_colors: Vec3,
-        grad_encoded: Word,
-        grad_matrices: Real,
-    ): ...
+    @wp.func_native(snippet(FIELDS + backward_text(features)))
+    def backward(thread: wp.int32, threads: wp.int32, fused: Fused): ...
 
     @wp.kernel(
         enable_backward=False, grid_stride=False, module="unique", launch_bounds=(FORWARD_THREADS, FORWARD_BLOCKS)
     )
-    def fused_forward(  # noqa: PLR0913  # a kernel entry point
-        first: wp.int32,
-        threads: wp.int32,
-        table: Half,
-        mask: wp.uint32,
-        positions: Vec3,
-        depths: Real,
-        directions: Vec3,
-        resolutions: Real,
-        focal: Real,
-        packed: Word,
-        width: wp.int32,
-        height: wp.int32,
-        hits: wp.int32,
-        shift: wp.int32,
-        offset: wp.float32,
-        clamp: wp.int32,
-        # outputs
-        encoded: Word,
-        colors: Vec3,
-    ):
-        forward(
-            first + wp.tid(),
-            threads,
-            table,
-            mask,
-            positions,
-            depths,
-            directions,
-            resolutions,
-            focal,
-            packed,
-            width,
-            height,
-            hits,
-            shift,
-            offset,
-            clamp,
-            encoded,
-            colors,
-        )
+    def fused_forward(first: wp.int32, threads: wp.int32, fused: Fused):
+        forward(first + wp.tid(), threads, fused)
 
     @wp.kernel(
         enable_backward=False, grid_stride=False, module="unique", launch_bounds=(BACKWARD_THREADS, BACKWARD_BLOCKS)
     )
-    def fused_backward(  # noqa: PLR0913  # a kernel entry point
-        first: wp.int32,
-        threads: wp.int32,
-        encoded: Word,
-        directions: Vec3,
-        packed: Word,
-        width: wp.int32,
-        height: wp.int32,
-        hits: wp.int32,
-        shift: wp.int32,
-        scale: Real,
-        colors: Vec3,
-        grad_colors: Vec3,
-        # outputs
-        grad_encoded: Word,
-        grad_matrices: Real,
-    ):
-        backward(
-            first + wp.tid(),
-            threads,
-            encoded,
-            directions,
-            packed,
-            width,
-            height,
-            hits,
-            shift,
-            scale,
-            colors,
-            grad_colors,
-            grad_encoded,
-            grad_matrices,
-        )
+    def fused_backward(first: wp.int32, threads: wp.int32, fused: Fused):
+        backward(first + wp.tid(), threads, fused)
 
     return SimpleNamespace(forward=fused_forward, backward=fused_backward)

@@ -9,6 +9,7 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
@@ -19,9 +20,26 @@ CHUNKS = 16
 CHUNKS_A_THREAD = 4
 # Where all take alike: handing out a chunk costs 9 us, during which no other thread can do so.
 EVEN_CHUNKS_A_THREAD = 2
-SMALLEST_CHUNK = 256
-# Of kernels that do little a thread: handing out a chunk costs as much as some hundred of those.
+# Handing out a chunk costs as much as some hundred threads of a kernel that does little.
 LIGHT_CHUNK = 4096
+
+
+@dataclass(frozen=True)
+class Sharing:
+    """How CPU threads share a launch out.
+
+    Attributes:
+        smallest: what one thread is given at least.
+        align: runs of this many neighbours stay in one thread, since they write to the same place.
+        even: whether equal parts of the range take about equally long.
+    """
+
+    smallest: int = LIGHT_CHUNK
+    align: int = 1
+    even: bool = True
+
+
+LIGHT, UNEVEN = Sharing(), Sharing(even=False)
 
 _threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -48,7 +66,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
 
 
-def chunks(dim: int, align: int = 1, smallest: int = SMALLEST_CHUNK, most: int = CHUNKS) -> list[tuple[int, int]]:
+def chunks(dim: int, align: int, smallest: int, most: int) -> list[tuple[int, int]]:
     """Split [0, dim) into at most `most` ranges of at least `smallest`, at multiples of `align`."""
     size = max(smallest, -(-dim // most))
     size = -(-size // align) * align
@@ -121,11 +139,11 @@ def _launch_again(
     kernel: wp.Kernel,
     shape: tuple[int, ...],
     values: list[Any],
-    device: wp.Device,
     stream: wp.Stream,
     block_dim: int,
 ) -> None:
     """Launch on a GPU by the kernel's command. Threads take turns: a command's arguments are its own."""
+    device = stream.device
     key = (kernel, device.alias, block_dim)
     with _commands_lock:
         command = _commands.get(key)
@@ -143,53 +161,27 @@ def launch(
     device: wp.Device,
     stream: wp.Stream | None = None,
     block_dim: int = 256,
-    align: int = 1,
-    smallest: int = LIGHT_CHUNK,
-    even: bool = True,
-    adjoint: tuple[Sequence[Any], Sequence[Any]] | None = None,
+    sharing: Sharing = LIGHT,
 ) -> None:
-    """Launch a kernel whose first argument is `first` over the leading dimension of `dim`.
+    """Launch a kernel, whose arguments are `first`, inputs and outputs, over the leading dimension of `dim`.
 
-    Args:
-        kernel: the kernel; its arguments are `first`, then inputs, then outputs.
-        dim: size of the thread range; the leading dimension is the one that is split on a CPU.
-        inputs: input arguments without `first`.
-        outputs: output arrays.
-        device: Warp device.
-        stream: CUDA stream, by default the device's current one.
-        block_dim: threads a block on CUDA.
-        align: on a CPU, runs of this many neighbours stay in one thread, since they write to the same place.
-        smallest: on a CPU, what one thread is given at least.
-        even: whether equal parts of the range take about equally long.
-        adjoint: (gradients of `inputs`, gradients of `outputs`); launches the generated adjoint. None marks what needs
-            no gradient. Gradients are added to.
+    On CUDA, `block_dim` is the threads of a block and `stream` by default the device's current one.
     """
     shape = (dim,) if isinstance(dim, int) else tuple(dim)
     if min(shape) == 0:
         return
-    extra: dict[str, Any] = {"device": device, "block_dim": block_dim, "record_tape": False}
-    if adjoint is not None:
-        extra |= {"adj_inputs": [None, *adjoint[0]], "adj_outputs": list(adjoint[1]), "adjoint": True}
+    if stream is not None:
+        _launch_again(kernel, shape, [0, *inputs, *outputs], stream, block_dim)
+        return
 
     def part(bounds: tuple[int, int]) -> None:
         first, last = bounds
-        wp.launch(
-            kernel,
-            (last - first, *shape[1:]),
-            inputs=[first, *inputs],
-            outputs=list(outputs),
-            stream=stream,
-            **extra,
-        )
+        here = (last - first, *shape[1:])
+        wp.launch(kernel, here, [first, *inputs], list(outputs), device=device, record_tape=False)
 
-    if not device.is_cpu:
-        if adjoint is None and stream is not None:
-            _launch_again(kernel, shape, [0, *inputs, *outputs], device, stream, block_dim)
-        else:
-            part((0, shape[0]))
-        return
-    most = EVEN_CHUNKS_A_THREAD * _threads if even else max(CHUNKS, CHUNKS_A_THREAD * _threads)
-    ranges = chunks(shape[0], align, smallest, most) if len(shape) == 1 else [(i, i + 1) for i in range(shape[0])]
+    most = EVEN_CHUNKS_A_THREAD * _threads if sharing.even else max(CHUNKS, CHUNKS_A_THREAD * _threads)
+    split = chunks(shape[0], sharing.align, sharing.smallest, most)
+    ranges = split if len(shape) == 1 else [(i, i + 1) for i in range(shape[0])]
     if _threads == 1 or len(ranges) == 1:
         for bounds in ranges:
             part(bounds)

@@ -146,25 +146,11 @@ def launch(
     outputs: Sequence[Argument],
     *,
     block_dim: int = 256,
-    align: int = 1,
-    smallest: int = launching.LIGHT_CHUNK,
-    even: bool = True,
-    adjoint: tuple[Sequence[Argument], Sequence[Argument]] | None = None,
+    sharing: launching.Sharing = launching.LIGHT,
 ) -> None:
     """Launch on the device and current stream of `like`; see `nexwarp.kernels.launch.launch`."""
-    launching.launch(
-        kernel,
-        dim,
-        inputs,
-        outputs,
-        device=device_of(like),
-        stream=stream_of(like),
-        block_dim=block_dim,
-        align=align,
-        smallest=smallest,
-        even=even,
-        adjoint=adjoint,
-    )
+    device, stream = device_of(like), stream_of(like)
+    launching.launch(kernel, dim, inputs, outputs, device=device, stream=stream, block_dim=block_dim, sharing=sharing)
 
 
 def sums_in_fixed_point(like: torch.Tensor) -> bool:

@@ -7,6 +7,7 @@ import torch
 import warp as wp
 
 from nexwarp.kernels.adam import CPU_VALUES, VALUES, adam_kernel
+from nexwarp.kernels.launch import Sharing
 from nexwarp.ops._interop import array, launch
 
 SMALLEST_SHARE = 64  # threads of a chunk on a CPU, at least
@@ -68,7 +69,7 @@ def adam_step(
     inputs += [*betas, *(1.0 - beta for beta in betas), *(math.log(beta) for beta in betas), epsilon]
     outputs = [array(x.view(-1), wp.float32) for x in (parameter, moments.mean, moments.square)]
     outputs += [array(nothing.half() if half is None else half.view(-1), wp.float16), array(losses, wp.float32)]
-    launch(parameter, adam_kernel(), threads, inputs, outputs, smallest=SMALLEST_SHARE)
+    launch(parameter, adam_kernel(), threads, inputs, outputs, sharing=Sharing(SMALLEST_SHARE))
     return None if factors is None else losses.sum()
 
 

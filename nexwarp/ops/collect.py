@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel, gradient_types, reduce_slots_kernel
+from nexwarp.kernels.launch import Sharing
 from nexwarp.kernels.types import MAX_HITS, TILE_SIZE, TileLists, types
 from nexwarp.native.staging import BLOCK_DIM
 from nexwarp.ops._interop import (
@@ -147,7 +148,8 @@ def launch_pixels(like: torch.Tensor, kernel: wp.Kernel, tiles: int, arguments: 
     """Launch a kernel over the pixels of a number of tiles."""
     pixels = TILE_SIZE**2
     # All pixels of a tile write to its entries, so one CPU thread must walk them all.
-    launch(like, kernel, tiles * pixels, arguments, [], block_dim=BLOCK_DIM, align=pixels, smallest=pixels, even=False)
+    sharing = Sharing(smallest=pixels, align=pixels, even=False)
+    launch(like, kernel, tiles * pixels, arguments, [], block_dim=BLOCK_DIM, sharing=sharing)
 
 
 class SlotSums:

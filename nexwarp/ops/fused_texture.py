@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from nexwarp.kernels.fused_texture import (
     BACKWARD_THREADS,
     FORWARD_BLOCKS,
     FORWARD_THREADS,
+    Fused,
     fused_kernels,
     half_scale,
     order_gradients,
@@ -26,42 +28,14 @@ from nexwarp.native.fused_texture import (
     GRADIENTS,
     MATRICES,
     OUTPUTS,
-    WARPS,
     WIDTH,
     logical_feature,
     logical_output,
 )
-from nexwarp.ops._interop import Argument, Context, array, graph_is_kept, launch
+from nexwarp.ops._interop import Argument, Context, array, graph_is_kept, launch, struct
 from nexwarp.ops.neural_field import HALF_GRADIENT, Field, Points, Rays
 
 GROUP_BYTES = 2**24  # of sums that a launch of the backward lookup adds to: a third of an H100's L2 cache
-
-
-class Shape(NamedTuple):
-    """An image's points, as the kernels order them.
-
-    Attributes:
-        width, height: in pixels; without an image, the number of directions and 1.
-        hits: K.
-        shift: tiles are (1 << shift) pixels wide and (16 >> shift) high.
-    """
-
-    width: int
-    height: int
-    hits: int
-    shift: int
-
-    @staticmethod
-    def of(points: Points, rays: Rays) -> "Shape":
-        """Return the shape of points along rays."""
-        height, width = rays.image or (1, len(rays.directions))
-        return Shape(width, height, len(points) // max(len(rays.directions), 1), 3 if height > 1 else 4)
-
-    @property
-    def units(self) -> int:
-        """Number of tiles times hits."""
-        wide, high = 1 << self.shift, 16 >> self.shift
-        return -(-self.width // wide) * -(-self.height // high) * self.hits
 
 
 def fits(grid: torch.Tensor, weights: Sequence[torch.Tensor], points: int) -> bool:
@@ -110,11 +84,8 @@ class Kept(NamedTuple):
 def colors(points: Points, field: Field, rays: Rays, *, keep: bool) -> torch.Tensor:
     """Return colours (n, 3), differentiable with respect to positions, depths, grid and weights.
 
-    Args:
-        points: float32, contiguous.
-        field: with its `table`.
-        rays: contiguous.
-        keep: whether there will be a backward pass.
+    Points are float32; they and `rays` are contiguous, and `field` has its `table`. `keep` says whether there will be
+    a backward pass.
     """
     return _Colors.apply(points, field, rays, keep, points.positions, points.depths, field.grid, *field.weights)
 
@@ -130,9 +101,8 @@ class _Colors(torch.autograd.Function):
     ) -> torch.Tensor:
         result, kept = forward(points, field, rays, keep)
         if keep:
-            assert field.table is not None
-            ctx.rays = Rays(rays.directions[:0], rays.offset, rays.clamp, rays.image)
-            fixed = (rays.directions, points.focal, field.table, field.resolutions)
+            ctx.rays = replace(rays, directions=rays.directions[:0])
+            fixed = (rays.directions, points.focal, field.stored(), field.resolutions)
             ctx.save_for_backward(points.positions, points.depths, *fixed, *kept, *field.weights)
         return result
 
@@ -142,9 +112,19 @@ class _Colors(torch.autograd.Function):
         positions, depths, directions, focal, table, resolutions, encoded, packed, result, *weights = ctx.saved_tensors
         need_positions, need_depths, need_grid = ctx.needs_input_grad[4:7]
         points, field = Points(positions, depths, focal), Field(table, weights, resolutions, True, table)
-        rays = Rays(directions, ctx.rays.offset, ctx.rays.clamp, ctx.rays.image)
-        backward_pass = Backward(points, field, rays, Kept(encoded, packed, result), again=graph_is_kept())
-        grad_grid, grad_points, grad_matrices = backward_pass(grad.contiguous(), need_positions or need_depths)
+        kept, grad = Kept(encoded, packed, result), grad.contiguous()
+        scale, unscale = _scales(grad)
+        grad_encoded = torch.empty_like(encoded) if graph_is_kept() else encoded  # else gradients overwrite features
+        fused, units = _fused(points, field, replace(ctx.rays, directions=directions), kept)
+        for name, tensor, dtype in (
+            ("scale", scale, wp.float32),
+            ("unscale", unscale, wp.float32),
+            ("grad_colors", grad, wp.vec3),
+            ("grad_encoded", grad_encoded, wp.int32),
+        ):
+            fused[name] = array(tensor, dtype)
+        grad_matrices = _mlp_backward(fused, weights, table, unscale, units)
+        grad_grid, grad_points = _scatter(fused, points, table, units, need_positions or need_depths)
         return (
             *(None,) * 4,
             grad_points[:, :3] if need_positions else None,
@@ -154,106 +134,81 @@ class _Colors(torch.autograd.Function):
         )
 
 
+def _fused(points: Points, field: Field, rays: Rays, kept: Kept) -> tuple[dict[str, Argument], int]:
+    """The fields of `kernels.fused_texture.Fused` that all kernels read, and the number of tiles times hits."""
+    height, width = rays.image or (1, len(rays.directions))
+    hits, shift = len(points) // max(len(rays.directions), 1), 3 if height > 1 else 4
+    units = -(-width // (1 << shift)) * -(-height // (16 >> shift)) * hits
+    table = field.stored()
+    fields = {
+        "width": width,
+        "height": height,
+        "hits": hits,
+        "shift": shift,
+        "positions": array(points.positions, wp.vec3),
+        "depths": array(points.depths, wp.float32),
+        "directions": array(rays.directions, wp.vec3),
+        "table": array(table.view(-1), wp.float16),
+        "mask": table.shape[1] - 1,
+        "resolutions": array(field.resolutions, wp.float32),
+        "focal": array(points.focal, wp.float32),
+        "packed": array(kept.packed, wp.int32),
+        "offset": rays.offset,
+        "clamp": int(rays.clamp),
+        "encoded": array(kept.encoded, wp.int32),
+        "colors": array(kept.colors, wp.vec3),
+    }
+    return fields, units
+
+
 def forward(points: Points, field: Field, rays: Rays, keep: bool) -> tuple[torch.Tensor, Kept]:
-    """Return the colours (n, 3), and what `Backward` needs, without the features unless `keep`."""
-    table, shape = field.stored(), Shape.of(points, rays)
-    packed = _pack(field.weights, table.shape[2])
-    encoded = torch.empty(shape.units * 256 if keep else 0, dtype=torch.int32, device=table.device)
-    result = torch.empty_like(points.positions)
-    warps = _warps(points.positions, shape.units // shape.hits, FORWARD_BLOCKS * FORWARD_THREADS // 32)
-    inputs = [
-        array(table.view(-1), wp.float16),
-        wp.uint32(table.shape[1] - 1),
-        array(points.positions, wp.vec3),
-        array(points.depths, wp.float32),
-        array(rays.directions, wp.vec3),
-        array(field.resolutions, wp.float32),
-        array(points.focal, wp.float32),
-        array(packed, wp.int32),
-        *shape,
-        rays.offset,
-        int(rays.clamp),
-    ]
-    outputs = [array(encoded, wp.int32), array(result, wp.vec3)]
-    _launch(fused_kernels(table.shape[2]).forward, points.positions, warps, inputs, outputs, FORWARD_THREADS)
-    return result, Kept(encoded, packed, result if rays.clamp else result.new_empty(0, 3))
+    """Return the colours (n, 3), and what the backward pass needs, without the features unless `keep`."""
+    packed, result = _pack(field.weights, field.grid.shape[2]), torch.empty_like(points.positions)
+    kept = Kept(packed.new_empty(0), packed, result)
+    fused, units = _fused(points, field, rays, kept)
+    if keep:
+        kept = kept._replace(encoded=packed.new_empty(units * 256))
+        fused["encoded"] = array(kept.encoded, wp.int32)
+    threads = FORWARD_THREADS * FORWARD_BLOCKS * _multiprocessors(result)
+    kernel = fused_kernels(field.grid.shape[2]).forward
+    launch(result, kernel, threads, [threads, struct(Fused, **fused)], [], block_dim=FORWARD_THREADS)
+    return result, kept if rays.clamp else kept._replace(colors=result.new_empty(0, 3))
 
 
-class Backward(NamedTuple):
-    """The backward pass.
+def _mlp_backward(
+    fused: dict[str, Argument],
+    weights: Sequence[torch.Tensor],
+    table: torch.Tensor,
+    unscale: torch.Tensor,
+    units: int,
+) -> list[torch.Tensor]:
+    """Write the gradients of the features, scaled, and return those of the matrices."""
+    features, blocks = table.shape[2], BACKWARD_BLOCKS * _multiprocessors(table)
+    slots = unscale.new_empty(blocks, sum(GRADIENTS))
+    arguments = struct(Fused, **fused, grad_matrices=array(slots.view(-1), wp.float32))
+    threads = BACKWARD_THREADS * blocks
+    launch(table, fused_kernels(features).backward, threads, [threads, arguments], [], block_dim=BACKWARD_THREADS)
+    order = _order(features, len(weights[-1]), table.device)
+    flat = unscale.new_empty(len(order))
+    inputs = [array(slots.sum(0), wp.float32), array(order, wp.int32), array(unscale, wp.float32)]
+    launch(table, order_gradients, len(order), inputs, [array(flat, wp.float32)])
+    parts = flat.split([matrix.numel() for matrix in weights])
+    return [part.view_as(matrix) for part, matrix in zip(parts, weights, strict=True)]
 
-    Attributes:
-        points, field, rays: of `forward`.
-        kept: of `forward`.
-        again: whether `kept` will be needed again; otherwise the features are overwritten by their gradients.
-    """
 
-    points: Points
-    field: Field
-    rays: Rays
-    kept: Kept
-    again: bool
-
-    def __call__(
-        self, grad_colors: torch.Tensor, need_points: bool
-    ) -> tuple[torch.Tensor, torch.Tensor, list[torch.Tensor]]:
-        """Return the gradients of the grid (L, T, F), of positions and depths (n, 4) if needed, and of the matrices."""
-        scale, unscale = _scales(grad_colors)
-        grad_encoded = torch.empty_like(self.kept.encoded) if self.again else self.kept.encoded
-        sums = self._mlp(grad_colors, scale, grad_encoded)
-        weights = self.field.weights
-        order = _order(self.field.grid.shape[2], len(weights[-1]), grad_colors.device)
-        flat = grad_colors.new_empty(len(order))
-        inputs = [array(sums, wp.float32), array(order, wp.int32), array(unscale, wp.float32)]
-        launch(grad_colors, order_gradients, len(order), inputs, [array(flat, wp.float32)])
-        parts = flat.split([matrix.numel() for matrix in weights])
-        grad_matrices = [part.view_as(matrix) for part, matrix in zip(parts, weights, strict=True)]
-        return *self._scatter(grad_encoded, unscale, need_points), grad_matrices
-
-    def _mlp(self, grad_colors: torch.Tensor, scale: torch.Tensor, grad_encoded: torch.Tensor) -> torch.Tensor:
-        """Write the gradients of the features, and return those of the matrices in permuted order, both scaled."""
-        shape = Shape.of(self.points, self.rays)
-        warps = _warps(grad_colors, shape.units, BACKWARD_BLOCKS * WARPS)
-        sums = grad_colors.new_empty(warps // (WARPS if grad_colors.is_cuda else 1), sum(GRADIENTS))
-        inputs = [
-            array(self.kept.encoded, wp.int32),
-            array(self.rays.directions, wp.vec3),
-            array(self.kept.packed, wp.int32),
-            *shape,
-            array(scale, wp.float32),
-            array(self.kept.colors, wp.vec3),
-            array(grad_colors, wp.vec3),
-        ]
-        outputs = [array(grad_encoded, wp.int32), array(sums.view(-1), wp.float32)]
-        kernel = fused_kernels(self.field.grid.shape[2]).backward
-        _launch(kernel, grad_colors, warps, inputs, outputs, BACKWARD_THREADS)
-        return sums.sum(0)
-
-    def _scatter(
-        self, grad_encoded: torch.Tensor, unscale: torch.Tensor, need_points: bool
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the gradients of the grid (L, T, F), and of positions and depths (n, 4) if needed."""
-        table, positions, shape = self.field.stored(), self.points.positions, Shape.of(self.points, self.rays)
-        grad_grid = torch.zeros_like(table, dtype=torch.float32)
-        grad_points = positions.new_empty(len(positions) * need_points, 4)
-        levels, size, features = table.shape
-        inputs = [
-            array(table.view(-1), wp.float16),
-            array(positions, wp.vec3),
-            array(self.points.depths, wp.float32),
-            array(self.field.resolutions, wp.float32),
-            array(self.points.focal, wp.float32),
-            wp.uint32(size - 1),
-            array(grad_encoded.view(torch.float16), wp.float16),
-            array(unscale, wp.float32),
-            *shape,
-        ]
-        outputs = [array(grad_grid.view(-1), wp.float32), array(grad_points, wp.vec4)]
-        kernel, threads = fused_scatter_kernel(features), shape.units * (32 if positions.is_cuda else 1)
-        for group in level_groups(levels, size * features * 4):
-            # In one thread on a CPU.
-            launch(positions, kernel, threads, [*inputs, *group], outputs, block_dim=SCATTER_THREADS, smallest=threads)
-        return grad_grid, grad_points
+def _scatter(
+    fused: dict[str, Argument], points: Points, table: torch.Tensor, units: int, need_points: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the gradients of the grid (L, T, F), and of positions and depths (n, 4) if needed."""
+    levels, size, features = table.shape
+    grad_grid = torch.zeros_like(table, dtype=torch.float32)
+    grad_points = points.positions.new_empty(len(points) * need_points, 4)
+    outputs = {"grad_table": array(grad_grid.view(-1), wp.float32), "grad_points": array(grad_points, wp.vec4)}
+    kernel = fused_scatter_kernel(features)
+    for first, end in level_groups(levels, size * features * 4):
+        arguments = struct(Fused, **fused, **outputs, first_level=first, end_level=end)
+        launch(table, kernel, units * 32, [arguments], [], block_dim=SCATTER_THREADS)
+    return grad_grid, grad_points
 
 
 def level_groups(levels: int, level_bytes: int) -> list[tuple[int, int]]:
@@ -273,19 +228,8 @@ def level_groups(levels: int, level_bytes: int) -> list[tuple[int, int]]:
     return list(zip(starts, [*starts[1:], levels], strict=True))
 
 
-def _launch(
-    kernel: wp.Kernel, like: torch.Tensor, warps: int, inputs: list[Argument], outputs: list[Argument], block_dim: int
-) -> None:
-    """Launch a kernel whose second argument is its number of threads, on CUDA 32 for each warp."""
-    threads = warps * 32 if like.is_cuda else warps
-    launch(like, kernel, threads, [threads, *inputs], outputs, block_dim=block_dim, smallest=threads)
-
-
-def _warps(like: torch.Tensor, most: int, each: int) -> int:
-    """Return how many warps share out the work: `each` a multiprocessor on CUDA."""
-    if not like.is_cuda:
-        return min(most, 2)
-    return torch.cuda.get_device_properties(like.device).multi_processor_count * each
+def _multiprocessors(like: torch.Tensor) -> int:
+    return torch.cuda.get_device_properties(like.device).multi_processor_count
 
 
 def _pack(weights: Sequence[torch.Tensor], features: int) -> torch.Tensor:

@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import torch
 import warp as wp
 
+from nexwarp.kernels.launch import UNEVEN
 from nexwarp.kernels.tile_lists import (
     count_kernel,
     depth_keys_kernel,
@@ -120,7 +121,7 @@ def intersect_tiles(
     arguments = [array(order, wp.int32), polygons, wp.vec2i(columns, rows)]
     threads = list_threads(count, means.is_cuda)
     totals, ends = (torch.empty(count, dtype=x, device=means.device) for x in (torch.int64, torch.int32))
-    launch(means, count_kernel(real), threads, arguments, [array(totals, wp.int64)], even=False)
+    launch(means, count_kernel(real), threads, arguments, [array(totals, wp.int64)], sharing=UNEVEN)
     _scan(totals)
     learns = room is None and means.is_cuda
     exact = room is None and not learns
@@ -178,7 +179,7 @@ def _sorted_entries(
     # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
     surfels = array(ends.new_empty(room) if exact else None, wp.int32)
     emitted = [array(tile_ids[:room], wp.int32), array(values[:room], wp.int32), surfels]
-    launch(ends, emit, threads, emission, [array(ends, wp.int32), *emitted], even=False)
+    launch(ends, emit, threads, emission, [array(ends, wp.int32), *emitted], sharing=UNEVEN)
     if not threads:
         values[:room] = 0
         tile_ids[:room] = tiles

@@ -1,4 +1,4 @@
-"""The fused texturing kernels agree with the reference, on a CPU, which emulates a warp, and on CUDA."""
+"""The fused texturing kernels, which are for CUDA alone, agree with the reference."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -82,57 +82,12 @@ def make_case(
     return Case(hits, leaves, rays, texture.resolutions.to(device), focal, signal.to(device))
 
 
-def fused_on_cpu(case: Case, again: bool = False) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Return colours and gradients as the kernels' CPU branch computes them."""
-    points, field, rays = case.inputs(half=True)
-    with torch.no_grad():
-        colors, kept = fused_texture.forward(points, field, rays, True)
-        features = kept.encoded.clone()
-        backward = fused_texture.Backward(points, field, rays, kept, again)
-        grad_grid, grad_points, matrices = backward(case.signal, True)
-    assert torch.equal(features, kept.encoded) is again
-    return colors, [grad_points[:, :3], grad_points[:, 3], grad_grid, *matrices]
-
-
 def assert_agree(
     colors: torch.Tensor, gradients: list[torch.Tensor], expected: torch.Tensor, references: list[torch.Tensor]
 ) -> None:
     assert_close(colors, expected, kind="value", name="colours", precision=torch.float16)
     for name, gradient, reference in zip(NAMES, gradients, references, strict=True):
         assert_close(gradient, reference, kind="gradient", name=name, precision=torch.float16)
-
-
-@pytest.mark.parametrize(
-    ("features", "degree", "clamp", "size"),
-    [
-        (4, 3, False, (19, 5, 2)),
-        pytest.param(2, 2, True, (37, 1, 3), marks=pytest.mark.slow),
-        pytest.param(4, 1, True, (8, 2, 1), marks=pytest.mark.slow),
-        pytest.param(2, 0, False, (9, 7, 1), marks=pytest.mark.slow),
-    ],
-)
-def test_emulated_kernels_agree_with_the_reference(
-    features: int, degree: int, clamp: bool, size: tuple[int, int, int]
-) -> None:
-    case = make_case(torch.device("cpu"), features, degree, clamp, size)
-    expected = case.reference()
-    references = torch.autograd.grad(expected, case.leaves, case.signal)
-    assert_agree(*fused_on_cpu(case), expected, list(references))
-
-
-def test_gradients_may_overwrite_the_features() -> None:
-    case = make_case(torch.device("cpu"), 4, 3, False, (19, 5, 2))
-    for name, one, other in zip(NAMES, fused_on_cpu(case)[1], fused_on_cpu(case, again=True)[1], strict=True):
-        assert torch.equal(one, other), name
-
-
-def test_levels_launched_apart_give_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
-    case = make_case(torch.device("cpu"), 4, 3, False, (19, 5, 2))
-    together = fused_on_cpu(case)[1]
-    monkeypatch.setattr(fused_texture, "GROUP_BYTES", 2**14)
-    assert len(fused_texture.level_groups(8, 2**14)) == 5
-    for name, apart, one in zip(NAMES, fused_on_cpu(case)[1], together, strict=True):
-        assert_close(apart, one, kind="value", name=name)
 
 
 CUDA_SIZES = [(200, 130, 2), (37, 1, 3), (129, 66, 1), (40, 30, 8)]
@@ -186,6 +141,17 @@ def test_what_the_fused_kernels_do_not_take_is_computed_in_layers(counted: list[
     with torch.no_grad():
         case.texture(fused=True)
     assert counted == [400]
+
+
+@pytest.mark.cuda
+def test_levels_launched_apart_give_the_same_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = make_case(torch.device("cuda"), 4, 3, False, (19, 5, 2))
+    together = torch.autograd.grad(case.texture(fused=True), case.leaves, case.signal)
+    monkeypatch.setattr(fused_texture, "GROUP_BYTES", 2**14)
+    assert len(fused_texture.level_groups(8, 2**14)) == 5
+    apart = torch.autograd.grad(case.texture(fused=True), case.leaves, case.signal)
+    for name, one, other in zip(NAMES, apart, together, strict=True):
+        assert_close(one, other, kind="value", name=name)
 
 
 @pytest.mark.cuda

@@ -87,7 +87,7 @@ def test_collect_does_not_depend_on_threads(size):
         results.append(passes.buffers() | {"blended": passes.blended(errors)})
         results[-1] |= {f"grad_{name}": grad for name, grad in passes.gradients().items()}
         results[-1]["requested"] = present(request.sums_after_backward)
-    assert len(launch.chunks(4 * 3 * 16**2)) > 3  # there was something to share out
+    assert len(launch.chunks(4 * 3 * 16**2, 16**2, 16**2, 16)) > 3  # there was something to share out
     assert_identical(results)
 
 
