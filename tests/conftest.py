@@ -25,10 +25,7 @@ MOST_WORKERS = 4  # each takes 1 to 2 GB
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """A whole run uses two or more processes; some files, and tests on a GPU with its memory, are for one.
-
-    A process starts in 5 s, most of which torch and Warp take.
-    """
+    """A whole run uses up to four processes; some files, and tests on a GPU with its memory, are for one."""
     named, marks = config.getoption("file_or_dir"), config.getoption("markexpr")
     if named or ("cuda" in marks and "not cuda" not in marks):
         return 0
@@ -59,9 +56,10 @@ def seed() -> None:
 @pytest.fixture(scope="session", autouse=True)
 def usual_signals() -> Iterator[None]:
     """Signals stop the tests' commands even where pytest itself runs under nohup or in a script's background."""
-    usual: dict[str, Any] = {"SIGINT": signal.default_int_handler, "SIGHUP": signal.SIG_DFL, "SIGTERM": signal.SIG_DFL}
-    found = {getattr(signal, name): handler for name, handler in usual.items() if hasattr(signal, name)}
-    before = {number: signal.signal(number, handler) for number, handler in found.items()}
+    usual: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    if hasattr(signal, "SIGHUP"):
+        usual[signal.SIGHUP] = signal.SIG_DFL
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
     yield
     for number, handler in before.items():
         signal.signal(number, handler)

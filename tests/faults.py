@@ -32,12 +32,11 @@ class Disk:
     def ask(self, what: str, path: Any) -> None:
         if isinstance(path, int):
             path = os.readlink(f"/proc/self/fd/{path}")
-        if not Path(os.path.abspath(path)).is_relative_to(self.folder):
-            return
-        self.requests.append(f"{what} {Path(path).name}")
-        count = len(self.requests) - 1
-        if self.fatal is not None and (count == self.fatal or (self.lasting and count > self.fatal)):
-            raise OSError(self.number, os.strerror(self.number))
+        if Path(os.path.abspath(path)).is_relative_to(self.folder):
+            self.requests.append(f"{what} {Path(path).name}")
+            count = len(self.requests) - 1
+            if self.fatal is not None and (count == self.fatal or (self.lasting and count > self.fatal)):
+                raise OSError(self.number, os.strerror(self.number))
 
 
 class Failing:
@@ -69,10 +68,7 @@ class Failing:
         return self
 
     def __exit__(self, kind: Any, *_: Any) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.file.close()
+        (self if kind is None else self.file).close()
 
 
 @contextmanager
@@ -118,15 +114,8 @@ def failing(disk: Disk) -> Iterator[Disk]:
         yield disk
 
 
-SYSTEM_CALLS = (
-    (Path, "write_bytes"),
-    (os, "fsync"),
-    (os, "replace"),
-    (Path, "rename"),
-    (Path, "mkdir"),
-    (Path, "touch"),
-    (Path, "rmdir"),
-)
+SYSTEM_CALLS = [(Path, name) for name in ("write_bytes", "rename", "mkdir", "touch", "rmdir")]
+SYSTEM_CALLS += [(os, name) for name in ("fsync", "replace")]
 
 
 class Killed(BaseException):
@@ -165,10 +154,7 @@ def kill_at(patch: pytest.MonkeyPatch, moment: int) -> list[str]:
 
 
 class Allocator:
-    """Counts allocations and kernel launches, and fails the `fatal`-th request (from 0) as a GPU without memory does.
-
-    A request is a call of one of torch's functions that make a tensor, or the launch of a kernel, from any thread.
-    """
+    """Counts allocations and kernel launches, and fails the `fatal`-th (from 0) as a GPU without memory does."""
 
     def __init__(self, fatal: int | None = None) -> None:
         self.fatal, self.requests = fatal, 0

@@ -1,5 +1,6 @@
 """Writers of the demo: smaller, in each input format, and through distorted lenses."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -9,8 +10,10 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
+from nexwarp.data import Scene, View, load_scene
 from nexwarp.data.demo import demo_folder
 from nexwarp.data.lens import Lens, pycolmap_module
+from nexwarp.io.pictures import save_png, to_uint8
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # As nerfstudio turns a COLMAP world: z up.
@@ -184,3 +187,23 @@ def write_blender(demo: Path, folder: Path, centred: bool = False, points: bool 
     for split, listed in frames.items():
         (folder / f"transforms_{split}.json").write_text(json.dumps({**shared, "frames": listed}))
     return folder
+
+
+def exposure_at(view: View) -> float:
+    return 0.75 + 0.08 * view.camera.position[0].item()
+
+
+def with_exposures(scene: Scene) -> Scene:
+    """Return a scene whose photos grow brighter along the capture."""
+
+    def exposed(views: list[View]) -> list[View]:
+        return [dataclasses.replace(view, image=to_uint8(view.image / 255 * exposure_at(view))) for view in views]
+
+    return dataclasses.replace(scene, train=exposed(scene.train), test=exposed(scene.test))
+
+
+def expose_photos(folder: Path) -> None:
+    """Make the photos of a scene grow brighter along the capture, in their PNG files."""
+    scene = with_exposures(load_scene(folder))
+    for view in (*scene.train, *scene.test):
+        save_png(folder / "images" / view.name, view.image)

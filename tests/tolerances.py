@@ -14,14 +14,10 @@ TOLERANCES = {
     torch.float16: {"value": 2e-3, "gradient": 3e-2},
 }
 
-FLIPS = 0.005
-"""Fraction of pixels that may flip in float32: a hit on the alpha cut-off, two hits of equal weight."""
-
-ACTIVATION = 2e-6
-"""How far an activated value may come back from the one given to `Surfels.from_activated`."""
-
-FLOOR = 1e-12
-"""Norm below which an expected tensor counts as zero."""
+FLIPS = 0.005  # fraction of pixels that may flip in float32: a hit on the alpha cut-off, two hits of equal weight
+ACTIVATION = 2e-6  # how far an activated value may come back from the one given to `Surfels.from_activated`
+FLOOR = 1e-12  # norm below which an expected tensor counts as zero
+WEB_PSNR = {"full": 50.0, "quantised": 40.0}  # least PSNR, dB, of the web page's pictures, by the scene file's quality
 
 
 def assert_close(
@@ -33,15 +29,10 @@ def assert_close(
     precision: torch.dtype | None = None,
     allow_flips: float = 0.0,
 ) -> None:
-    """Fail unless `actual` is finite and within the table's tolerance of `expected`.
+    """Fail unless `actual` is finite and within the table's tolerance of `expected`, of any dtype.
 
-    Args:
-        actual: what the code under test gave; its dtype picks the row of the table.
-        expected: what it should be, of the same shape, any dtype.
-        kind: "value" or "gradient".
-        name: of the tensor, for the message.
-        precision: row of the table, where the dtype of `actual` does not tell it.
-        allow_flips: at most this fraction of pixels, the worst ones, is left out of images (H, W, ...).
+    `kind` is "value" or "gradient"; `precision` is the table's row where the dtype of `actual` does not tell it. Of
+    images (H, W, ...), at most the fraction `allow_flips` of pixels, the worst ones, is left out.
     """
     assert actual.shape == expected.shape, f"{name}: shape {tuple(actual.shape)}, not {tuple(expected.shape)}"
     assert_finite(actual, name)
@@ -51,7 +42,9 @@ def assert_close(
     expected = expected.detach().double().cpu()
     error = (actual - expected).abs()
     if allow_flips:
-        error = without_flips(error, allow_flips)
+        per_pixel = error.reshape(error.shape[0] * error.shape[1], -1)
+        flipped = per_pixel.sum(-1).topk(int(allow_flips * len(per_pixel))).indices
+        error = per_pixel.index_fill(0, flipped, 0.0).reshape(error.shape)
     relative = error.norm().item() / max(expected.norm().item(), FLOOR)
     worst = error.max().item() / max(expected.abs().max().item(), FLOOR) if error.numel() else 0.0
     good = relative <= tolerance and (precision != torch.float64 or worst <= tolerance)
@@ -78,21 +71,9 @@ def assert_finite(tensor: torch.Tensor, name: str) -> None:
     assert not bad.any(), f"{name}: {int(bad.sum())} elements are not finite, first {bad.nonzero()[0].tolist()}"
 
 
-def without_flips(error: torch.Tensor, fraction: float) -> torch.Tensor:
-    """Zero the worst pixels of `error` (H, W, ...), at most `fraction` of them."""
-    per_pixel = error.reshape(error.shape[0] * error.shape[1], -1)
-    dropped = int(fraction * len(per_pixel))
-    worst = per_pixel.sum(-1).topk(dropped).indices
-    return per_pixel.index_fill(0, worst, 0.0).reshape(error.shape)
-
-
 def describe_worst(error: torch.Tensor, actual: torch.Tensor, expected: torch.Tensor) -> str:
     """Say where the largest error is, and what stood there."""
     if not error.numel():
         return "No elements."
     where = tuple(int(i) for i in torch.unravel_index(error.argmax(), error.shape))
     return f"Worst at {where}: actual {actual[where].item():.9g}, expected {expected[where].item():.9g}"
-
-
-WEB_PSNR = {"full": 50.0, "quantised": 40.0}
-"""Least PSNR, dB, of the WGSL renderer's pictures against `Model.render`, by the scene file's quality."""

@@ -112,16 +112,12 @@ def test_equations_of_the_method_page_have_their_numbers():
     ("text", "right"),
     [
         ("Densification (paper Sec. 4.3, paper Sec. 8.2).", True),
-        ("The plain colours N (paper Eq. 6).", True),
         ("Collection pass (paper Sec. 3.2).", False),
         ("Collection pass (Sec. 4.2).", False),
         ("fades levels, Delta (paper Eq. 4 and 5)", False),
-        ("Delta (paper Eqs. 4)", False),
         ("Adam's moments (paper Eq. 4)", False),
-        ('The losses of the paper\'s section "Optimization"', False),
     ],
 )
 def test_what_counts_as_a_citation(text, right):
     cited = list(citations("text", text))
     assert cited and all(problem(citation, table()) is None for citation in cited) == right
-    assert not list(citations("text", "2 seconds 3; sections: 4; sequence 5; 10 sec of 3; Section headings"))

@@ -5,7 +5,6 @@ python -m tests.docs.test_docs --write      # writes docs/options.md and docs/cl
 
 import ast
 import contextlib
-import dataclasses
 import importlib.util
 import inspect
 import io
@@ -18,7 +17,7 @@ import sys
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import pytest
 
@@ -43,21 +42,11 @@ SYMBOLS: dict[str, tuple[str, str]] = {
     "texture.table_size": ("T", "5"),
 }
 
-INTRODUCTION = """\
+SETTINGS = """\
 # Settings
 
-Options of each command, and settings of a training ([below](#settings-of-a-training)). The page is made from the code
-by `python -m tests.docs.test_docs --write`; a test fails if the two disagree.
-
-Every command has `--help` ([Commands](cli.md)). Bad input gives one line on stderr and exit code 2. Ctrl-C exits
-with 130.
-"""
-
-SETTINGS = """\
-## Settings of a training
-
-What a person chooses of `nexwarp.Config`. `--preset` picks the values to start from, the flags of `nexwarp train`
-change some, and `--set KEY=VALUE`, repeated, any:
+What a person chooses of a training, `nexwarp.Config`; the options of all commands are in [Commands](cli.md). `--preset`
+picks the values to start from, the flags of `nexwarp train` change some, and `--set KEY=VALUE`, repeated, any:
 
     nexwarp train SCENE --preset paper --set texture.table_size=65536
     nexwarp train SCENE --set mask_mode=background --set losses.depth=0.1 --set 'background=[0, 0, 0]'
@@ -71,7 +60,7 @@ All others, such as learning rates and the texture's shape, are documented in
 of `demo`; `--set` reaches them, too.
 
 Symbol and section are the publication's; "code" means that only the authors' code has the setting. Values that differ
-are bold. [Presets and paper](paper.md) says why.
+are bold. [Presets and paper](paper.md) says why. `python -m tests.docs.test_docs --write` makes this page of the code.
 """
 
 
@@ -90,28 +79,6 @@ def field_docs(owner: type) -> dict[str, str]:
     return docs
 
 
-def options(command: Any) -> Iterator[tuple[str, str, str]]:
-    """What a command takes: how it is written, its default, what it means."""
-    docs, hints = field_docs(command), get_type_hints(command, include_extras=True)
-    for field in dataclasses.fields(command):
-        kind = getattr(hints[field.name], "__origin__", None)
-        if dataclasses.is_dataclass(kind):
-            assert isinstance(kind, type)
-            yield from options(kind)
-            continue
-        extras = getattr(hints[field.name], "__metadata__", ())
-        shown = next((extra for extra in extras if hasattr(extra, "metavar")), None)
-        name = f"--{((shown and shown.name) or field.name).replace('_', '-')}"
-        choices = getattr(hints[field.name], "__args__", ()) if shown is None else ()
-        metavar = (shown and shown.metavar) or ("{" + ",".join(choices) + "}" if choices else "")
-        if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            yield metavar, "required", docs[field.name]
-            continue
-        hint = shown.help_behavior_hint if shown else None
-        default = hint.removeprefix("(default: ").strip("()") if hint else field.default
-        yield f"{name} {metavar}".strip(), "off" if default is False else str(default), docs[field.name]
-
-
 def described_settings() -> Iterator[tuple[str, str]]:
     """Names of the settings that a person chooses, and what they mean."""
     for name in USER_SETTINGS:
@@ -125,15 +92,7 @@ def cell(text: Any) -> str:
 
 def options_page() -> str:
     """The text of docs/options.md."""
-    page = [INTRODUCTION]
-    for name, command in cli.COMMANDS.items():
-        rows = list(options(command))
-        needed = " ".join(option for option, default, _ in rows if default == "required")
-        page.append(f"## nexwarp {name} {needed}".rstrip() + f"\n\n{inspect.getdoc(command)}\n")
-        page.append("| option | default | what |\n|---|---|---|")
-        page += [f"| `{cell(option)}` | {cell(default)} | {cell(text)} |" for option, default, text in rows]
-        page.append("")
-    page.append(SETTINGS)
+    page = [SETTINGS]
     page.append("| KEY | default | `paper` | what | symbol | section |\n|---|---|---|---|---|---|")
     ours, paper = preset("default"), preset("paper")
     for name, text in described_settings():
@@ -151,7 +110,8 @@ COMMANDS_PAGE = """\
 # Commands
 
 What `nexwarp COMMAND --help` prints. The page is made from the code by `python -m tests.docs.test_docs --write`; a test
-fails if the two disagree. [Settings](options.md) has the same options as tables, and the keys of `--set`.
+fails if the two disagree. [Settings](options.md) has the keys of `--set`. Bad input gives one line on stderr and exit
+code 2. Ctrl-C exits with 130.
 """
 ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
@@ -186,19 +146,6 @@ def test_pages_are_those_of_the_code(name, made):
 
 def test_few_settings_are_for_users():
     assert set(SYMBOLS) <= set(USER_SETTINGS) <= set(setting_names()) and len(USER_SETTINGS) <= 20
-
-
-@pytest.mark.parametrize("name", cli.COMMANDS)
-def test_the_options_page_says_what_help_says(name):
-    """The same options, defaults and words, so that the page's own reading of the code is right."""
-    out = help_text(name, width=600)
-    shown = " ".join(out.replace("│", " ").split())
-    rows = list(options(cli.COMMANDS[name]))
-    found = set(re.findall(r"^[ │]+(--[a-z][a-z-]*)", out, re.M))
-    assert found == {option.split()[0] for option, _, _ in rows if option.startswith("--")}
-    for option, default, text in rows:
-        ending = {"required": " (required)", "off": "", "repeatable": " (repeatable)"}
-        assert f"{option} {text}{ending.get(default, f' (default: {default})')}" in shown, option
 
 
 def test_settings_on_the_page_can_be_set():

@@ -20,8 +20,7 @@ from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.train.settings import setting_names
 from tests.docs.test_docs import DOCS, ROOT
-from tests.exposed import expose_photos
-from tests.scene_writers import write_demo
+from tests.scene_writers import expose_photos, write_demo
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +80,7 @@ def test_files(run):
 
 
 def test_tensors(run):
-    """Names, types and shapes of the table are those of the file."""
+    """Names, types and shapes of the table are those of the file, and the keys of its metadata."""
     tensors, meta = header(run)
     rows = re.findall(r"^\| `([a-z0-9A-Z_.]+)` \| (F\d\d) \| ([^|]+) \|", section("model.safetensors"), re.M)
     shape = meta["texture"]
@@ -101,12 +100,7 @@ def test_tensors(run):
         else:
             expected[name] = (dtype, [sizes[d.strip()] for d in dimensions.split(",")])
     assert {name: (t["dtype"], t["shape"]) for name, t in tensors.items()} == expected
-
-
-def test_metadata(run):
-    _, meta = header(run)
-    text = section("model.safetensors").split("a JSON object:", 1)[1]
-    assert set(named(text)) == flat(meta, "texture")
+    assert set(named(section("model.safetensors").split("a JSON object:", 1)[1])) == flat(meta, "texture")
 
 
 def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):

@@ -62,9 +62,7 @@ def test_the_readme_on_pypi_links_to_files_that_exist() -> None:
     text = package.absolute_links((ROOT / "README.md").read_text(encoding="utf-8"))
     targets = re.findall(r"\]\(([^)\s]+)\)", text)
     assert targets and all(re.match(r"https?://|#", target) for target in targets)
-    ours = re.findall(
-        r"https://(?:github\.com|raw\.githubusercontent\.com)/nexwarp/nexwarp/(?:blob/)?main/([^)#\s]+)", text
-    )
+    ours = re.findall(r"https://(?:raw\.)?github\w*\.com/nexwarp/nexwarp/(?:blob/)?main/([^)#\s]+)", text)
     assert "docs/capture.jpg" in ours and all((ROOT / name).exists() for name in ours)
 
 

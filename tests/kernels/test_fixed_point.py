@@ -11,11 +11,11 @@ import warp as wp
 import nexwarp as nw
 from nexwarp.native.fixed_point import LARGEST
 from nexwarp.ops._interop import from_fixed_point
-from tests.fixed_point_kernels import add_in_order
 from tests.narrowing import present
 from tests.ops.test_threads import Passes, errors_of
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
+from tests.warp_kernels import add_in_order
 
 
 def summed(terms: torch.Tensor, order: torch.Tensor) -> torch.Tensor:

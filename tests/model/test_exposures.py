@@ -34,9 +34,8 @@ from nexwarp.train.step_losses import SATURATION, as_taken
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import TrainingViews, mean_color
-from tests.exposed import exposure_at, with_exposures
 from tests.narrowing import present
-from tests.scene_writers import write_demo
+from tests.scene_writers import exposure_at, with_exposures, write_demo
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 

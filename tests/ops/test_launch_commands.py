@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from nexwarp.ops._interop import array, launch
-from tests.command_kernels import scaled_sum
+from tests.warp_kernels import scaled_sum
 
 
 class Call(NamedTuple):

@@ -12,8 +12,8 @@ from nexwarp.kernels.types import types
 from nexwarp.ops import tape as passes
 from tests.narrowing import present
 from tests.scenes import CAMERA_KEYS, SURFEL_KEYS, random_scene
-from tests.tape_kernels import REAL, matmul, relu, weighted_sum
 from tests.tolerances import assert_close
+from tests.warp_kernels import REAL, matmul, relu, weighted_sum
 
 HITS = 2
 

@@ -20,8 +20,7 @@ from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.finish.finish import FinishObserver
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
-from tests.exposed import expose_photos
-from tests.scene_writers import write_demo
+from tests.scene_writers import expose_photos, write_demo
 from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[2]

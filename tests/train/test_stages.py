@@ -26,8 +26,7 @@ from nexwarp.train.recipe import PRESETS, TextureConfig, preset
 from nexwarp.train.report import StepReport
 from nexwarp.train.settings import config_from_dict
 from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, stage_runner
-from tests.exposed import expose_photos
-from tests.scene_writers import write_demo
+from tests.scene_writers import expose_photos, write_demo
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 

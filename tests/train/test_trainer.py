@@ -15,7 +15,7 @@ from nexwarp.run.evaluate import evaluate
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.recipe import Config, DensifyConfig, LearningRates, TextureConfig
 from nexwarp.train.trainer import Trainer
-from tests.exposed import with_exposures
+from tests.scene_writers import with_exposures
 from tests.tolerances import assert_close
 from tests.trainer_support import OFTEN, TEXTURE, assert_same_state, rescaled, small, trained
 
