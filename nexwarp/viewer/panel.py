@@ -11,7 +11,6 @@ from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.viewer.camera_path import PathEditor
 from nexwarp.viewer.controls import T, on_change, on_click, set_changed, within
 from nexwarp.viewer.modes import BY_SLOT, MODES, Picture
-from nexwarp.viewer.pacing import Share
 
 if TYPE_CHECKING:
     import viser
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
 
 FOV_DEGREES = (15.0, 110.0)
 SCREENSHOT_HEIGHTS = (64, 2160)
-SHARES = (5, 80)  # percent
 TELL_SECONDS = 0.5  # between two updates of a training's status line
 HELP = """\
 **Drag** orbit · **right drag** pan · **scroll** zoom
@@ -69,8 +67,11 @@ class Panel:
         self._connect(sh_degree, "sh_degree")
         self._connect(as_trained, "as_trained")
         self._connect(exposure, "photo_exposure")
-        on_change(self.fov, lambda value: self.session.look(within(value, FOV_DEGREES)))
+        on_change(self.fov, self._set_fov)
         self.show(None, None)
+
+    def _set_fov(self, degrees: float) -> None:
+        self.session.client.camera.fov = float(np.deg2rad(within(degrees, FOV_DEGREES)))
 
     def _connect(self, control: "viser.GuiInputHandle[T]", name: str) -> None:
         """Make a control change a setting, and show the clamped value."""
@@ -89,7 +90,8 @@ class Panel:
         from viser import Icon
 
         gui, session = self.gui, self.session
-        on_click(gui.add_button("Back to the start", icon=Icon.HOME), session.reset)
+        home = session.home
+        on_click(gui.add_button("Back to the start", icon=Icon.HOME), lambda: session.go(home.pose, home.fov))
         if not session.cameras:
             gui.add_markdown("This run has no cameras.")
             return
@@ -132,27 +134,20 @@ class Panel:
 
 
 class TrainingPanel:
-    """The controls of a training: progress, pause, and the share of time for pictures."""
+    """The controls of a training: progress and pause."""
 
-    def __init__(self, gui: "viser.GuiApi", total: int, share: Share, wake: Callable[[], None]) -> None:
+    def __init__(self, gui: "viser.GuiApi", total: int, wake: Callable[[], None]) -> None:
         """Add the controls of a training of `total` iterations; `wake` is called when it is paused or resumed."""
         from viser import Icon
 
-        self.total, self.share, self.wake = total, share, wake
+        self.total, self.wake = total, wake
         self.paused = False  # held between two steps
         self._last: tuple[float, int] | None = None  # time and step of the last status line
         with gui.add_folder("Training", order=0.0):
             self.progress = gui.add_progress_bar(0.0)
             self.status = gui.add_markdown("starting")
             self.pause = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
-            hint = "Percent of the training's time, while a browser is connected"
-            percent = round(100 * share.share)
-            self.share_slider = gui.add_slider("Time for pictures", *SHARES, 5, percent, hint=hint)
         on_click(self.pause, self.toggle_pause)
-        on_change(self.share_slider, self._set_share)
-
-    def _set_share(self, percent: float) -> None:
-        self.share.share = within(percent, SHARES) / 100.0
 
     def toggle_pause(self) -> None:
         """Pause the training, or resume it."""
@@ -176,4 +171,4 @@ class TrainingPanel:
         self.paused = False
         self.status.content = text
         set_changed(self.progress, "value", 100.0)
-        self.pause.visible = self.share_slider.visible = False
+        self.pause.visible = False

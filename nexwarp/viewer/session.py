@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 COLOURS = {"train": (64, 130, 240), "test": (245, 150, 40)}
 MOST_FRUSTUMS = 500
-MOST_WAITING = 2000  # messages that a client has not taken yet, above which it gets no notifications
 
 
 class Session:
@@ -39,19 +38,18 @@ class Session:
         self.closed = threading.Event()
         self.panel = Panel(self)
         self._add_frustums()
-        client.camera.on_update(self.moved)
-        self.look_from(client.camera)
+        client.camera.on_update(self._moved)
+        self._take_over(client.camera)
 
     def waiting(self) -> int:
         """Number of messages that the client has not taken yet."""
         return self.viewer.web.waiting(self.client.client_id)
 
-    async def moved(self, camera: "viser.CameraHandle") -> None:
-        """Take over the browser's camera."""
-        self.look_from(camera)
+    async def _moved(self, camera: "viser.CameraHandle") -> None:
+        self._take_over(camera)
 
-    def look_from(self, camera: "viser.CameraHandle") -> None:
-        """Take over a camera; an invalid one is ignored."""
+    def _take_over(self, camera: "viser.CameraHandle") -> None:
+        """Take over the browser's camera; an invalid one is ignored."""
         size = (camera.image_width, camera.image_height)
         with suppress(TypeError, ValueError):
             self.viewpoint = Viewpoint.of(camera.wxyz, camera.position, camera.fov, *size, self.world)
@@ -72,19 +70,11 @@ class Session:
 
     # The view
 
-    def look(self, degrees: float) -> None:
-        """Set the vertical field of view."""
-        self.client.camera.fov = float(np.deg2rad(degrees))
-
     def jump(self, name: str) -> None:
         """Go to a camera of the scene; an unknown name is ignored."""
         if name in self.cameras:
             camera = self.cameras[name]
             self.go(camera_to_world(camera), vertical_fov(camera))
-
-    def reset(self) -> None:
-        """Go to the initial view."""
-        self.go(self.home.pose, self.home.fov)
 
     def go(self, pose: np.ndarray, fov: float) -> None:
         """Move to a (4, 4) camera-to-world pose in the scene's frame, and orbit a point in front of it; fov in rad."""
@@ -147,17 +137,10 @@ class Session:
             frustums[i].visible = bool(far[i])
         self.shown = far
 
-    # Requests and notes
-
     def take_screenshot(self, height: int) -> None:
         """Request a picture of this height in pixels, in place of one that is not drawn yet."""
         self.screenshot = height
         self.viewer.wake()
-
-    def tell(self, title: str, text: str) -> None:
-        """Show a notification in the browser, unless it takes no messages."""
-        if self.waiting() <= MOST_WAITING:
-            self.client.add_notification(title, text, auto_close_seconds=10.0)
 
 
 def _wxyz(pose: np.ndarray) -> tuple[float, float, float, float]:

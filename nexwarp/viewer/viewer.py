@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.paths import surrounding
 from nexwarp.io.files import one_line
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.model.model import Model
@@ -26,8 +27,7 @@ from nexwarp.viewer.world import Viewpoint, World, clearest
 if TYPE_CHECKING:
     import viser
 
-SHARE = 0.2  # of a training's time for pictures, at the start
-DEFAULT_FOV = 0.9  # radians
+SHARE = 0.2  # of a training's time for pictures
 THUMBNAIL_SIDE = 96  # pixels along the longer side
 MOST_PATHS = 100  # written into the run
 log = logging.getLogger(__name__)
@@ -79,8 +79,10 @@ class Viewer:
         self.model, self.options, self.save_path = model, options, save_path
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
         self.photos = photos or {}
-        self.world = World.around(list(self.cameras.values()), model().surfels.means)
-        self.home = self._home()
+        means = model().surfels.means
+        placed = list(self.cameras.values()) or surrounding(means, options.near)
+        self.world = World.around(placed, means)
+        self.home = Viewpoint.of_camera(clearest(placed))
         self.focal_limit = max((camera.focal for camera in self.cameras.values()), default=math.inf)
         self.pace, self.share = pacing.Pace(), pacing.Share(SHARE)
         self.sessions: dict[int, Session] = {}
@@ -92,7 +94,7 @@ class Viewer:
         self.server, self.url = self.web.viser, self.web.url
         self._set_scene()
         if options.total is not None:
-            self.training = TrainingPanel(self.server.gui, options.total, self.share, self.wake)
+            self.training = TrainingPanel(self.server.gui, options.total, self.wake)
         self.server.on_client_disconnect(self._goodbye)
         self.server.on_client_connect(self._welcome)
         self.web.gate.is_open = True
@@ -189,7 +191,7 @@ class Viewer:
                     continue
             except Exception as error:  # for example out of memory; the other clients continue
                 session.drawn_version, session.drawn_scale, session.drawn_step = session.version, 1.0, self.step
-                session.tell("This picture could not be drawn", _reason(error))
+                session.panel.show(None, f"This picture could not be drawn: {_reason(error)}")
             seconds = time.perf_counter() - start
             return min(seconds, pacing.FIRST_SECONDS) if is_first else seconds
         return None
@@ -262,14 +264,6 @@ class Viewer:
 
     # The page
 
-    def _home(self) -> Viewpoint:
-        """The initial view: the camera with the clearest one, or one of the surfels' middle if there are no cameras."""
-        if self.cameras:
-            return Viewpoint.of_camera(clearest(list(self.cameras.values())))
-        pose = np.eye(4)
-        pose[:3, 3] = self.world.focus - np.array([0.0, 0.0, 3.0 * self.world.unit])
-        return Viewpoint(pose, DEFAULT_FOV, 1280, 720)
-
     def _set_scene(self) -> None:
         server, start = self.server, self.server.initial_camera
         position, forward = self.home.pose[:3, 3], self.home.pose[:3, 2]
@@ -291,7 +285,6 @@ class Viewer:
                     self.sessions[client.client_id] = session
             self.wake()
         except Exception as error:  # for example out of memory
-            log.warning("the viewer could not serve a browser tab: %s", _reason(error))
             client.add_notification("The viewer could not serve this tab: reload it", _reason(error))
 
     def _read_photos(self) -> None:

@@ -41,18 +41,14 @@ class World:
 
     @staticmethod
     def around(cameras: Sequence[Camera], means: torch.Tensor) -> "World":
-        """Choose a frame for the cameras of a scene; without cameras, for the (N, 3) means of its surfels."""
-        points = means.detach().double().cpu().numpy()
-        middle = np.median(points, axis=0) if len(points) else np.zeros(3)
-        if not cameras:
-            spread = np.median(np.linalg.norm(points - middle, axis=1)) if len(points) else 1.0
-            return World(middle, float(spread) or 1.0, UP, middle)
+        """Choose a frame for the cameras of a scene and the (N, 3) means of its surfels."""
         poses = np.stack([camera_to_world(camera) for camera in cameras])
         centres, axes = poses[:, :3, 3], poses[:, :3, 2]
         centre = centres.mean(axis=0)
         radius = np.linalg.norm(centres - centre, axis=1).max()
+        middle = means.detach().double().median(dim=0).values.cpu().numpy() if len(means) else centre
         away = np.linalg.norm(middle - centre)
-        radius = radius if radius > 1e-6 * away else away
+        radius = radius if radius > 1e-6 * away else away  # of cameras at one place
         up = -poses[:, :3, 1].mean(axis=0)
         up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else UP
         try:

@@ -1,12 +1,13 @@
 """What one client may cost: pictures, messages, connections and memory are bounded, and the other clients go on."""
 
+import gc
 import math
+import os
 import socket
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from functools import partial
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -14,8 +15,7 @@ import numpy as np
 import pytest
 
 from nexwarp.errors import OutOfMemoryError
-from nexwarp.viewer import Viewer, pacing, security
-from nexwarp.viewer import session as session_module
+from nexwarp.viewer import Viewer, security
 from nexwarp.viewer import viewer as viewer_module
 from nexwarp.viewer.modes import Picture, draw
 from nexwarp.viewer.pacing import BAND_PIXELS, FIRST_PIXELS, MOST_PIXELS, MOST_SIDE, Pace, limited
@@ -108,9 +108,7 @@ def test_a_client_that_reads_slowly_gets_few_pictures_and_is_closed(model, monke
                 assert time.monotonic() < end
                 for session in (mine, other):
                     session._changed()
-                    session.tell("again", "and again")
                 next(good.hear())
-                assert other.waiting() <= session_module.MOST_WAITING + 5
             assert heavy_pictures.count(other.client.client_id) <= 5
             wait_for(lambda: len(viewer.sessions) == 1)
         mine._changed()
@@ -200,8 +198,7 @@ def test_no_error_of_the_viewer_ends_a_training(model, monkeypatch, error, where
                 viewer.share.free_at = -math.inf
                 viewer.between_steps(step, fail if where == "status" else lambda: "fine")
             if where == "draw":
-                note = next(m for m in client.hear() if m["type"] == "NotificationShowMessage")
-                assert "could not be drawn" in str(note)
+                assert any("could not be drawn" in str(message) for message in client.hear())
             monkeypatch.setattr(viewer_module, "draw", draw)
             over = threading.Event()
             if where != "welcome":
@@ -215,28 +212,52 @@ def test_no_error_of_the_viewer_ends_a_training(model, monkeypatch, error, where
                     thread.join()
 
 
-def test_a_screenshot_counts_in_full_for_the_share_of_time(model, monkeypatch):
-    """A first picture does not, since it includes compilation."""
-    pytest.importorskip("viser")
+def resources() -> dict[str, int]:
+    """Open files, threads and resident bytes of this process."""
+    import psutil
 
-    def slow(*arguments: Any) -> Any:
-        time.sleep(0.3)
-        return draw(*arguments)
+    process = psutil.Process()
+    files = process.num_fds() if os.name == "posix" else process.num_handles()
+    return {"files": files, "threads": process.num_threads(), "bytes": process.memory_info().rss}
 
-    monkeypatch.setattr(viewer_module, "draw", slow)
-    monkeypatch.setattr(pacing, "FIRST_SECONDS", 0.1)
-    with Viewer(lambda: model, ring(), WATCHED) as viewer, Client(viewer) as client:
-        client.look()
-        session = session_of(viewer)
-        counted: list[float] = []
-        monkeypatch.setattr(viewer.share, "spend", lambda _, seconds: counted.append(seconds))
 
-        def drawn(count: int) -> bool:
-            viewer.between_steps(1, lambda: "fine")
-            return len(counted) >= count
+def clients() -> list[object]:
+    """All objects that stand for a client."""
+    viser = pytest.importorskip("viser")
+    kinds = {Session, viser.ClientHandle, security.Connection}
+    return [thing for thing in gc.get_objects() if type(thing) in kinds]
 
-        for count in (1, 2):
-            wait_for(lambda: not session.waiting())
-            session.take_screenshot(64)
-            wait_for(partial(drawn, count))
-        assert counted[0] == pacing.FIRST_SECONDS and counted[1] >= 0.3
+
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("count", [30, pytest.param(2000, marks=pytest.mark.slow)])
+def test_sessions_leave_nothing_behind(model, count, record_property):
+    """Files, threads and memory after many sessions: connect, one picture, disconnect."""
+    warm = max(count // 10, 10)
+    others = {id(thing): thing for thing in clients()}  # of other tests
+    with serving(model) as viewer:
+
+        def visit(number: int) -> None:
+            with Client(viewer, close_timeout=1.0) as client:
+                client.look(position=(0.01 * (number % 50), 0.0, -4.0))
+                assert client.picture().ndim == 3
+
+        def settled() -> dict[str, int]:
+            wait_for(lambda: not viewer.sessions and not viewer.web.gate.connections)
+            gc.collect()
+            return resources()
+
+        for number in range(warm):
+            visit(number)
+        before = settled()
+        for number in range(count):
+            visit(number)
+        after: dict[str, Any] = settled()
+        record_property("sessions", {"before": before, "after": after})
+        print(f"after {warm} sessions {before}, after {count} more {after}")
+        server = viewer.server._websock_server
+        assert not server._client_state_from_id and not server._live_connections
+        kept = {id(thing): thing for thing in clients()}
+        assert kept.keys() <= others.keys(), "nothing refers to a client that has left"
+    assert after["files"] <= before["files"] + 2
+    assert after["threads"] <= before["threads"] + 32, "viser's pool"
+    assert after["bytes"] <= before["bytes"] + 32 * 2**20

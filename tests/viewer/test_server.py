@@ -105,7 +105,6 @@ def test_a_picture_that_fails_is_told_and_the_rest_goes_on(model, monkeypatch):
         wait_for(lambda: len(viewer.sessions) == 1)
         (session,) = viewer.sessions.values()
         session.change("mode", "normal")
-        note = next(m for m in client.hear() if m["type"] == "NotificationShowMessage")
-        assert "out of memory" in str(note)
+        assert any("out of memory" in str(message) for message in client.hear())
         session.change("mode", "image")
         wait_for(lambda: session.drawn_version == session.version and session.drawn_scale == 1.0)

@@ -110,13 +110,6 @@ def test_an_empty_scene(quality):
     assert header["surfels"] == 0 and header["texture"] is None and read_surfels(content)["sh"].shape == (0, 16, 3)
 
 
-def test_the_size_follows_from_the_shape():
-    """Fox at 40,000 surfels: at most 6 MB, uncompressed parts added up; the demo's: at most 1 MB compressed."""
-    surfel = 3 * 2 + 4 + 2 * 2 + 1 + 2 + 2 * 2 + 48 + (7 + 4) * 8 / CHUNK
-    grid, mlp = 8 * 2**16 * 4, 2 * (32 * 64 + 64 * 64 + 64 * 48)
-    assert 40_000 * surfel + grid + mlp < 6e6
-
-
 def test_numbers_of_the_header_are_those_of_the_scene():
     model, camera = web_model(options=RenderOptions(max_hits=3, sh_degree=2))
     header, _ = read_sections(encode_scene(model, named_cameras(camera), title="a & b", poster=b"picture"))
@@ -154,17 +147,13 @@ def damaged() -> dict[str, bytes]:
     bombed = content[:begin] + bomb[: sh["bytes"]].ljust(sh["bytes"], b"\0") + content[begin + sh["bytes"] :]
     return {
         "empty": b"",
-        "another file": b"\x89PNG\r\n\x1a\n" + bytes(100),
         "newer version": content[:8] + struct.pack("<I", 2) + content[12:],
         "endless header": content[:12] + struct.pack("<I", 2**32 - 1) + content[16:],
         "no JSON": content[:16] + b"x" * length + content[16 + length :],
         "a list": content[:12] + struct.pack("<I", 2) + b"[]" + content[16 + length :],
         "ends in the header": content[: 16 + length // 2],
-        "ends in the geometry": content[: 16 + length + 200],
         "ends in the grid": content[:-8],
         "many surfels": changed(surfels=2**24),
-        "too many surfels": changed(surfels=2**40),
-        "no number of surfels": changed(surfels="60"),
         "half a surfel": changed(surfels=0.5),
         "other SH": changed(sh_coefficients=7),
         "a table of any size": changed(texture={**texture, "table_size": 2**26}),
@@ -172,22 +161,11 @@ def damaged() -> dict[str, bytes]:
         "endless levels": changed(texture={**texture, "levels": 10**9}),
         "K of 100": changed(options={**options, "max_hits": 100}),
         "no options": changed(options=None),
-        "no sections": changed(sections=[]),
         "sections of nothing": changed(sections=[None]),
-        "other type": entry("means", dtype="f32"),
         "other shape": entry("means", shape=[60, 3]),
         "behind the end": entry("grid", offset=10**12),
-        "before the start": entry("means", offset=-8),
-        "other encoding": entry("means", encoding="brotli"),
         "more than it has": entry("grid", bytes=10**9),
         "a bomb": bombed,
-        "other quality": changed(quality="best"),
         "low-pass filter": changed(options={**options, "low_pass": True}),
         "SH of degree 4": changed(sh_coefficients=25),
     }
-
-
-def test_a_wrong_quality_is_named():
-    model, camera = web_model(3)
-    with pytest.raises(ValueError, match="--quality: expected quantised or full, got 'best'"):
-        encode_scene(model, {"a": camera}, quality="best")

@@ -28,8 +28,8 @@ PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 <canvas id="canvas" width="37" height="27"></canvas>
 <script type="module">
 import { Renderer } from "nexwarp/renderer.js";
-import { SceneReader, fromHalf, toHalf } from "nexwarp/scene.js";
-window.nexwarp = { Renderer, SceneReader, fromHalf, toHalf };
+import { SceneReader } from "nexwarp/scene.js";
+window.nexwarp = { Renderer, SceneReader };
 </script>"""
 OPEN = """async ([file, settings, canvas]) => {
     window.stages = [];
@@ -242,18 +242,6 @@ def test_what_cannot_be_rendered_is_named(tab, default):
     large = {**entry_of(camera), "width": 60_000, "height": 60_000}
     assert "picture of 60000 x 60000 pixels" in tab.page.evaluate(text, [large, {}])
     assert tab.render(camera)[1]["image"].shape == (camera.height, camera.width, 3)
-
-
-def test_half_precision_numbers_are_those_of_numpy(tab):
-    halves = np.arange(0, 2**16, 7, dtype=np.uint16)
-    values = halves.view(np.float16)
-    finite = halves[np.isfinite(values)]
-    numbers = tab.page.evaluate("(halves) => halves.map(nexwarp.fromHalf)", finite.tolist())
-    np.testing.assert_array_equal(numbers, finite.view(np.float16).astype(np.float64))
-    rng = np.random.default_rng(0)
-    floats = (rng.standard_normal(2000) * 10.0 ** rng.integers(-9, 5, 2000)).astype(np.float32)
-    bits = tab.page.evaluate("(floats) => floats.map(nexwarp.toHalf)", floats.astype(float).tolist())
-    np.testing.assert_array_equal(np.array(bits, np.uint16), floats.astype(np.float16).view(np.uint16))
 
 
 def test_damaged_files_give_one_line(tab):
