@@ -79,20 +79,10 @@ def check_tensors(
     dtype: torch.dtype | None = None,
     device: torch.device | None = None,
 ) -> dict[str, int]:
-    """Check the types, shapes, dtypes and devices of several tensors.
+    """Return the sizes of the named dimensions of several tensors; TypeError or ValueError name one that does not fit.
 
-    Args:
-        tensors: argument name -> (tensor, shape); a string in a shape names a dimension, which must
-            have the same size wherever the name occurs.
-        dtype: dtype of all tensors; by default that of the first one, which must be floating.
-        device: device of all tensors; by default that of the first one.
-
-    Returns:
-        The sizes of the named dimensions.
-
-    Raises:
-        TypeError: a value is not a tensor or has another dtype.
-        ValueError: a tensor has another shape or is on another device.
+    `tensors` has a tensor and its shape for each argument; a string in a shape names a dimension, which must have the
+    same size wherever the name occurs. By default, dtype and device are those of the first one, which must be floating.
     """
     sizes: dict[str, int] = {}
     for name, (tensor, shape) in tensors.items():

@@ -53,10 +53,6 @@ class Session:
 
     A teacher's folder is a run, too: RUN/teachers/1 and so on. The teacher is complete once its metrics.json, which is
     written last, says how long the training took.
-
-    Attributes:
-        viewer: shows the training between steps; None shows nothing.
-        seconds: that complete teachers took.
     """
 
     def __init__(
@@ -208,16 +204,16 @@ class Session:
     def _write(self, stage: Stage, trainer: Trainer) -> Model:
         """Finish and write the model of a stage, its cameras and figures."""
         folder = self._folder(stage)
-        scene_cameras = trainer.scene.cameras
+        unrefined = trainer.scene.cameras
         with display.stages(self.console) as observe:
             finished = trainer.finish(observe)
         file = save_model(folder, finished)
         model = shared_model(file, self.ranks)
-        cameras = scene_cameras
+        cameras = unrefined
         if trainer.poses is not None:
             refined = trainer.views.refined_cameras(trainer.poses)
-            cameras = scene_cameras | {TRAIN: dict(zip(scene_cameras[TRAIN], refined, strict=True))}
-        save_cameras(folder / CAMERAS_FILE, cameras, scene_cameras)
+            cameras = unrefined | {TRAIN: dict(zip(unrefined[TRAIN], refined, strict=True))}
+        save_cameras(folder / CAMERAS_FILE, cameras, unrefined)
         facts = self._facts(stage, trainer)
         facts |= {"surfels": len(model.surfels), "megabytes": file.stat().st_size / 1e6}
         if stage.teacher:
@@ -228,8 +224,10 @@ class Session:
 
     def _facts(self, stage: Stage, trainer: Trainer) -> dict[str, Json]:
         """Return what metrics.json says of a training; for a student, with the time of the run's teachers."""
-        iterations = trainer.iteration + (0 if stage.teacher else stage.before)
-        seconds = trainer.seconds + (0.0 if stage.teacher else self.seconds)
+        iterations, seconds = trainer.iteration, trainer.seconds
+        if not stage.teacher:
+            iterations += stage.before
+            seconds += self.seconds
         facts: dict[str, Json] = {
             "preset": stage.config.preset,
             "iterations": iterations,
@@ -243,23 +241,22 @@ class Session:
 
     def _evaluate(self, trainer: Trainer, model: Model, facts: dict[str, Json]) -> None:
         """Evaluate the run's model on the test views, if there are any, and print the figures."""
-        scene = trainer.scene
-        run = self.run
+        views = trainer.scene.test
         rows = {}
-        if scene.test:
+        if views:
             mask_mode = trainer.config.mask_mode
             rows = figures(
-                evaluate_run(model, scene.test, run, self.console, facts, mask_mode=mask_mode, ranks=self.ranks)
+                evaluate_run(model, views, self.run, self.console, facts, mask_mode=mask_mode, ranks=self.ranks)
             )
         rows |= {
             "surfels": f"{len(model.surfels):,}",
             "model file": f"{facts['megabytes']:.1f} MB",
             "training": f"{facts['seconds']:.0f} s, {facts['iterations_per_second']:.1f} it/s",
-            "run": str(run),
+            "run": str(self.run),
         }
-        self.console.print(display.results_table(rows, f"{len(scene.test)} test views"))
-        if scene.test:
-            strip = run / RENDERS_FOLDER / COMPARE / picture_name(scene.test[0].name)
+        self.console.print(display.results_table(rows, f"{len(views)} test views"))
+        if views:
+            strip = self.run / RENDERS_FOLDER / COMPARE / picture_name(views[0].name)
             self.console.print(f"photo, render, error: {strip}")
 
     def _finish_with_others(self, stage: Stage, trainer: Trainer) -> Model:
@@ -278,14 +275,14 @@ def _model_kept(folder: Path, trainer: Trainer) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        model = "the current model is saved"
         try:
             save_model(folder, trainer.model())
-            model = "the current model is saved"
         except OSError:
             model = "the model cannot be saved either"
-        checkpoint = "there is no checkpoint"
-        if has_checkpoint(folder):
-            checkpoint = "--resume continues from the last checkpoint"
+        checkpoint = (
+            "--resume continues from the last checkpoint" if has_checkpoint(folder) else "there is no checkpoint"
+        )
         stop = f"training stops at iteration {trainer.iteration:,}: {model}, {checkpoint}"
         raise StorageError(f"{error}; {stop}") from error
 

@@ -263,18 +263,16 @@ class Train:
         return dataclasses.replace(config, background=scene.background)
 
     def _scene_of_video(self, ranks: Ranks, console: Console) -> str:
-        """Return the scene of a video, which rank 0 makes, after a check of what would stop the training later."""
-        video = Path(self.scene.path)
+        """Return the scene of a video, which rank 0 makes unless the run folder would be refused later."""
+        scene = scene_folder_of(Path(self.scene.path))
         if ranks.first:
             self._check()
-            for path in self.teachers:
-                load(path)
-            source = SceneSource(str(scene_folder_of(video)))
-            run = self.run or Path("runs") / source.name
-            self._record(run, prepare_run(run, source, resume=self.resume, overwrite=self.overwrite), ranks)
-            scene_of_video(video, console)
+            run = self.run or Path("runs") / scene.name
+            resume = prepare_run(run, SceneSource(str(scene)), resume=self.resume, overwrite=self.overwrite)
+            self._record(run, resume, ranks)
+            scene_of_video(Path(self.scene.path), console)
         ranks.barrier()
-        return str(scene_folder_of(video))
+        return str(scene)
 
     def _viewer(
         self, runner: StageRunner, scene: Scene, record: RunRecord, run: Path, console: Console

@@ -121,7 +121,7 @@ def test_damaged_files_of_a_run(finished, capsys):
         refused(capsys, [command, str(finished)], "model.safetensors", "expected a safetensors file")
 
 
-@pytest.mark.parametrize("columns", [40, 80, 200])
+@pytest.mark.parametrize("columns", [40, 200])
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

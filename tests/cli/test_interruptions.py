@@ -16,7 +16,7 @@ from nexwarp.cli.display import TrainingDisplay
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.densify import Densifier
 from nexwarp.train.trainer import Trainer
-from tests.cli.support import FLAGS, RUN_FILES, picture, read, refused, snapshot
+from tests.cli.support import FLAGS, RUN_FILES, read, refused, snapshot
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 
@@ -63,26 +63,6 @@ def test_an_interrupted_run_resumes_to_the_same_bits(trained, scene, tmp_path, c
         assert metrics[key] == expected[key], key
 
 
-def test_a_killed_run_resumes_to_the_same_bits(trained, scene, tmp_path):
-    """Without a chance to save anything, the last regular checkpoint serves."""
-
-    class Killed(BaseException):
-        pass
-
-    def kill(_: Any, step: Any) -> None:
-        if step.iteration == 7:
-            raise Killed
-
-    run = tmp_path / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TrainingDisplay, "__call__", kill)
-        with pytest.raises(Killed):
-            cli.main(["train", str(scene), "--run", str(run), *FLAGS])
-    assert read(run / "checkpoint", "state.json")["iteration"] == 6
-    assert cli.main(["train", str(scene), "--run", str(run), "--device", "cpu", "--resume"]) == 0
-    assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
-
-
 @pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129)])
 def test_other_signals_stop_in_order_too(trained, scene, tmp_path, capsys, name, code):
     number = getattr(signal, name)
@@ -95,17 +75,6 @@ def test_other_signals_stop_in_order_too(trained, scene, tmp_path, capsys, name,
     assert signal.getsignal(number) == before
     assert cli.main(["train", str(scene), "--run", str(run), "--device", "cpu", "--resume"]) == 0
     assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
-
-
-def test_a_closed_terminal_does_not_stop_what_nohup_started(scene, tmp_path):
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with pytest.MonkeyPatch.context() as patch:
-            interrupt_after(patch, FusedAdam, "step", 2, signal.SIGHUP)
-            command = ["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS, "--iterations", "3"]
-            assert cli.main(command) == 0
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 def test_checkpoints_come_as_often_as_asked_and_two_are_kept(trained, scene, tmp_path, monkeypatch, capsys):
@@ -246,13 +215,3 @@ def test_a_second_interrupt_does_not_wait(scene, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Densifier, "accumulate", insist)
         assert cli.main(["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS]) == 130
-
-
-def test_resume_takes_its_settings_from_the_run(scene, tmp_path):
-    """Also those that a scene is loaded with: a resumed run does not change its photos' size."""
-    run = tmp_path / "run"
-    assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, "--iterations", "2", "--downscale", "2"]) == 0
-    before = read(run, "metrics.json")
-    assert cli.main(["train", str(scene), "--run", str(run), "--resume", "--device", "cpu"]) == 0
-    assert picture(run / "renders" / "test" / "view_000.png").shape == (18, 24, 3)
-    assert read(run, "metrics.json")["views"] == before["views"]

@@ -200,9 +200,3 @@ def test_other_cameras_render_beside_the_photos(finished, capsys):
     capsys.readouterr()
     assert cli.main(["render", str(finished), "--camera", "panorama", "--buffers"]) == 2
     assert "--buffers: expected together with --camera pinhole" in capsys.readouterr().err
-
-
-def test_eval_keeps_the_facts_of_the_training(finished):
-    before = read(finished, "metrics.json")
-    assert cli.main(["eval", str(finished), "--device", "cpu"]) == 0
-    assert read(finished, "metrics.json") == before

@@ -5,7 +5,6 @@ import sys
 import types
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 import skimage.metrics
@@ -54,12 +53,6 @@ def test_ssim_map_is_scikit_images_away_from_the_border(device: torch.device) ->
     assert metrics.ssim(image, target) == pytest.approx(actual.mean().item(), abs=1e-6)
 
 
-def test_ssim_is_the_one_that_training_minimises(device: torch.device) -> None:
-    image, target = (picture.to(device) for picture in images())
-    loss = ops_ssim.weighted_dssim(image.double() / 255, target.double() / 255).item()
-    assert metrics.ssim(image, target) == pytest.approx(1 - loss, abs=2e-6)
-
-
 def test_psnr_by_hand() -> None:
     black, white = torch.zeros(4, 6, 3), torch.ones(4, 6, 3)
     assert metrics.psnr(black, white) == 0.0
@@ -77,14 +70,6 @@ def test_ssim_by_hand() -> None:
     a, b = 51 / 255, 204 / 255
     flat = ssim_map(torch.full((30, 30, 3), a), torch.full((30, 30, 3), b))
     assert flat[15, 15, 0].item() == pytest.approx((2 * a * b + 1e-4) / (a * a + b * b + 1e-4), abs=1e-4)
-
-
-def test_zeros_stand_outside_the_image() -> None:
-    """The padding of the convention: an image in a black frame has the same map inside."""
-    image, target = images(20, 24)
-    framed = [torch.nn.functional.pad(picture, (0, 0, 7, 7, 7, 7)) for picture in (image, target)]
-    inside = ssim_map(*framed)[7:-7, 7:-7]
-    assert (inside - ssim_map(image, target)).abs().max() < 2e-5
 
 
 @pytest.mark.parametrize("metric", [metrics.psnr, metrics.ssim])
@@ -108,17 +93,6 @@ def test_to_uint8_rounds_and_clamps() -> None:
         to_uint8(torch.tensor([0.0, float("nan")]))
     with pytest.raises(TypeError, match=r"image: expected uint8 or a floating dtype, got torch\.int64"):
         to_uint8(torch.zeros(3, dtype=torch.int64))
-
-
-def test_wrong_inputs_name_the_argument() -> None:
-    image = torch.zeros(4, 5, 3)
-    with pytest.raises(ValueError, match=r"image: expected shape \(H, W, 3\), got \(3, 4, 5\)"):
-        metrics.ssim(torch.zeros(3, 4, 5), image)
-    with pytest.raises(ValueError, match=r"target: expected shape \(4, 5, 3\), got \(4, 6, 3\)"):
-        metrics.psnr(image, torch.zeros(4, 6, 3))
-    array: Any = image.numpy()
-    with pytest.raises(TypeError, match=r"target: expected a torch\.Tensor, got ndarray"):
-        metrics.psnr(image, array)
 
 
 class FakeLPIPS(torch.nn.Module):

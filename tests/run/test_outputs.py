@@ -14,7 +14,7 @@ import nexwarp as nw
 from nexwarp.cameras.camera import resized
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, load_transforms, save_camera_path
-from nexwarp.cameras.paths import ellipse, interpolate, spiral
+from nexwarp.cameras.paths import ellipse, interpolate
 from nexwarp.cli import main as cli
 from nexwarp.data.scene import SceneSource
 from nexwarp.io.pictures import to_uint8
@@ -27,7 +27,7 @@ from nexwarp.run.folder import RunRecord, create_run
 from nexwarp.run.opened import open_model
 from nexwarp.run.render import RenderOrder
 from nexwarp.train.recipe import Config
-from tests.cameras.test_paths import ring, row
+from tests.cameras.test_paths import ring
 from tests.scenes import make_surfels, make_texture, random_scene
 
 TRAIN, TEST = ["b.png", "c.jpg", "d.png", "e.png"], ["a.png", "sub/f.png"]
@@ -134,13 +134,6 @@ def test_paths_are_those_of_the_runs_cameras(run: Path) -> None:
     assert not (run / "renders" / "test").exists()
 
 
-def test_spiral(run: Path) -> None:
-    cameras = [each.to(torch.float32) for each in row(5)]
-    save_cameras(run / "cameras.json", {"train": {str(i): each for i, each in enumerate(cameras)}, "test": {}})
-    assert command("render", run, "--path", "spiral", "--frames", "3") == 0
-    assert picture(run / "renders" / "spiral" / "0002.png").equal(rendered(run, spiral(cameras, 3)[2]))
-
-
 def test_a_shorter_path_leaves_no_frames_of_a_longer_one(run: Path) -> None:
     for count in (3, 2):
         assert command("render", run, "--path", "ellipse", "--frames", count) == 0
@@ -185,15 +178,6 @@ def test_video(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         # Of noise, 4:2:0 keeps the brightness alone.
         error = (mine.float() - frame.float()) @ torch.tensor([0.2126, 0.7152, 0.0722])
         assert error.abs().mean() < 2.0
-
-
-def test_video_takes_its_rate_from_the_file(run: Path, tmp_path: Path) -> None:
-    av = pytest.importorskip("av", reason="videos need PyAV (extra `video`)")
-    save_camera_path(tmp_path / "flight.json", interpolate(ring(3), 3), fps=5)
-    for flags, rate in (([], 5), (["--fps", "10"], 10)):
-        assert command("render", run, "--path", tmp_path / "flight.json", "--video", tmp_path / "a.mkv", *flags) == 0
-        with av.open(str(tmp_path / "a.mkv")) as container:
-            assert container.streams.video[0].average_rate == rate
 
 
 # Passes
@@ -325,15 +309,6 @@ def test_cameras_that_no_path_suits(refuses: Callable[..., None], run: Path) -> 
     refuses(["render", "--path", "spiral"], "--path spiral: cameras: expected cameras that face one way")
     save_cameras(run / "cameras.json", {"train": {"0": around["0"]}, "test": {"1": around["1"]}})
     refuses(["render"], "--path ellipse: cameras: expected two or more", "--frames 0 renders the still views alone")
-
-
-def test_targets_that_cannot_be_written(refuses: Callable[..., None], run: Path) -> None:
-    (run.parent / "file").touch()
-    refuses(["render", "--frames", "2", "--video", run.parent / "file" / "a.mp4"], "file")
-    (run.parent / "folder.mp4").mkdir()
-    refuses(["render", "--frames", "2", "--video", run.parent / "folder.mp4"], "folder.mp4: expected a file to write")
-    for kind in ("ply", "cameras"):
-        refuses(["export", "--format", kind, "--out", run.parent / "file"], "file")
 
 
 def test_bad_exports(refuses: Callable[..., None], run: Path, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import pytest
 import torch
 import warp as wp
 
-from nexwarp.cli import main as cli
 from nexwarp.kernels import launch as launching
 from nexwarp.run import warmup
 from nexwarp.train.densify import Densifier
@@ -129,20 +128,3 @@ def test_the_rehearsal_is_a_short_run(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(degrees) == {0, 1, 2, 3} and list(degrees) == sorted(degrees)
     assert set(watches) == {True, False} and list(watches) == sorted(watches, reverse=True)
     assert any(count for count, _ in rounds), "nothing was split"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--preset", "papr"], ("preset", "default, paper", "'papr'")),
-        (["--max-hits", "9"], ("--max-hits", "0 to 8", "got 9")),
-        (["--device", "gpu"], ("--device", "cuda or cpu", "'gpu'")),
-    ],
-)
-def test_bad_input_is_one_line(
-    arguments: list[str], words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["warmup", *arguments]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1
-    assert all(word in err for word in words)

@@ -22,7 +22,7 @@ from nexwarp.train import stages as train_stages
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
 from nexwarp.train.ranks.ranks import Ranks
-from nexwarp.train.recipe import PRESETS, TextureConfig, preset
+from nexwarp.train.recipe import TextureConfig
 from nexwarp.train.report import StepReport
 from nexwarp.train.settings import config_from_dict
 from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, stage_runner
@@ -70,10 +70,6 @@ def test_a_run_has_teachers_where_photos_are_few(changes: dict[str, Any], photos
     assert plan_teachers(config, photos).count == count
 
 
-def test_only_the_papers_preset_does_without() -> None:
-    assert {name: plan_teachers(preset(name), 21).count for name in PRESETS} == {"default": 2, "web": 2, "paper": 0}
-
-
 def test_settings_of_a_run_from_before_there_were_teachers_have_none() -> None:
     data = Config().as_dict()
     assert config_from_dict(data).teachers is None
@@ -108,26 +104,6 @@ def test_teachers_of_a_small_student_are_larger(budget: int, teachers: int) -> N
     assert {each.max_surfels for each in before} == {teachers} and student.max_surfels == budget
     # As in a run from before.
     assert {each.max_surfels for each in settings_of(config, OwnTeachers(2, 10))[:-1]} == {budget}
-
-
-def test_seeds_of_teachers_follow_from_the_runs() -> None:
-    def seeds(seed: int) -> list[int]:
-        return [each.seed for each in settings_of(Config(seed=seed), OwnTeachers(2, 10))[:-1]]
-
-    assert seeds(3) == seeds(3) and not set(seeds(3)) & set(seeds(4))
-
-
-def test_settings_that_do_not_go_together_are_refused() -> None:
-    with pytest.raises(ValueError, match="teachers: expected 0 or null where poses are learned, got 2"):
-        Config(teachers=2, refine_poses=True)
-    for wrong in (-1, 9):
-        with pytest.raises(ValueError, match=f"teachers: expected at least 0 and at most 8, got {wrong}"):
-            Config(teachers=wrong)
-
-
-def test_a_trainer_trains_one_model(tiny_scene: Scene) -> None:
-    with pytest.raises(ValueError, match=r"config.teachers: expected 0 or None.*nexwarp.train trains teachers first"):
-        Trainer(tiny_scene, CONFIG, CPU)
 
 
 def test_train_is_a_training_for_each_stage(tiny_scene: Scene, tmp_path: Path) -> None:
@@ -179,13 +155,6 @@ def test_a_run_estimates_exposures_once(exposed_folder: Path, calibrations: list
     *before, student = settings_of(config, OwnTeachers(2, 4, 240))
     files = [nw.train(scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in before]
     assert same(found, nw.train(scene, student, device=CPU, teachers=map(nw.load, files)))
-
-
-def test_the_command_estimates_exposures_once(exposed_folder: Path, calibrations: list[Config], tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    small = ["--iterations", "10", *SMALL[:-2], "--set", "exposures=true", "--set", "teachers=2"]
-    assert cli.main(["train", str(exposed_folder), "--run", str(run), *small]) == 0
-    assert len(calibrations) == 1 and nw.load(run).exposures is not None
 
 
 @pytest.fixture(scope="module")
@@ -309,27 +278,6 @@ def test_a_longer_run_keeps_its_teachers(
     assert model_of(run) == model
 
 
-def test_other_teachers_are_refused_where_a_run_has_its_own(
-    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
-    capsys.readouterr()
-    assert command(run, "--resume", "--teacher", str(finished)) == 2
-    told = " ".join(capsys.readouterr().err.split())
-    assert "--teacher: expected none, as the run to resume trains its own, got" in told
-
-
-def test_given_runs_take_the_place_of_own_teachers(
-    finished: Path, command: Callable[..., int], tmp_path: Path, tiny_scene: Scene
-) -> None:
-    run = tmp_path / "run"
-    assert command(run, "--teacher", str(finished)) == 0
-    assert not (run / "teachers").exists() and not read_run(run).own.count
-    expected = nw.train(tiny_scene, CONFIG, device=CPU, teachers=[nw.load(finished)])
-    assert same(nw.load(run), nw.load(expected.save(tmp_path)))
-
-
 def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(
     finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -391,40 +339,6 @@ def test_a_run_that_lost_a_teacher_says_so_before_it_trains(
     )
 
 
-def test_a_teacher_is_not_trained_on_its_own(
-    finished: Path, command: Callable[..., int], capsys: pytest.CaptureFixture[str]
-) -> None:
-    teacher = finished / "teachers" / "1"
-    for flag in ("--resume", "--overwrite"):
-        capsys.readouterr()
-        assert command(teacher, flag) == 2
-        assert "--run: expected a run of its own, got" in " ".join(capsys.readouterr().err.split())
-    assert (teacher / "model.safetensors").is_file()
-
-
-def test_checkpoints_of_a_complete_teacher_go_even_after_a_kill(
-    finished: Path, command: Callable[..., int], tmp_path: Path
-) -> None:
-    """That came between its last file and the deletion."""
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
-    shutil.copytree(run / "checkpoint", run / "teachers" / "1" / "checkpoint")
-    assert command(run, "--resume") == 0
-    assert not has_checkpoint(run / "teachers" / "1") and has_checkpoint(run)
-
-
-def test_a_longer_run_finishes_its_teachers_as_they_were(
-    finished: Path, command: Callable[..., int], tmp_path: Path
-) -> None:
-    """Although --iterations has grown before they were complete."""
-    run = tmp_path / "run"
-    create_run(run, RunRecord(read_run(finished).source, read_run(finished).config, own=OwnTeachers(2, 4, 240)))
-    assert command(run, "--resume", iterations=30) == 0
-    for number in "12":
-        assert model_of(run / "teachers" / number) == model_of(finished / "teachers" / number)
-    assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
-
-
 def test_an_older_run_keeps_teachers_of_its_own_budget(
     finished: Path, command: Callable[..., int], tmp_path: Path
 ) -> None:
@@ -466,43 +380,6 @@ def test_memory_that_a_teacher_lacks_is_told_as_its_own(
         told = capsys.readouterr().err.removeprefix("nexwarp: error: ").strip()
     assert told.startswith("teacher 1 of 2: out of memory at iteration 1: it needed 2.50 GiB")
     assert "--max-surfels (now 240)" in told and told.endswith(", or do without teachers (--set teachers=0)")
-
-
-def test_a_scene_without_test_views_has_teachers_with_metrics(tiny_scene: Scene, tmp_path: Path) -> None:
-    """Of the training alone; a resumed run finds them by these."""
-    scene = dataclasses.replace(tiny_scene, test=[])
-    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4, 240)
-    create_run(run, RunRecord(source, CONFIG, own=own))
-    models = []
-    for resume in (False, True):
-        session = Session(run, RunRecord(source, CONFIG, own=own), Console(quiet=True), Ranks.alone(CPU), resume=resume)
-        runner = stage_runner(scene, CONFIG, CPU, session, own=own)
-        assert runner.stage.teacher != resume
-        runner.train()
-        models.append(runner.finish())
-    assert same(*models) and not (run / "metrics.json").exists()
-
-
-def test_weights_and_biases_gets_the_runs_settings(
-    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given: list[dict[str, Any]] = []
-
-    class Sink:
-        def __init__(self, run: Path, settings: dict[str, Any]) -> None:
-            given.append(settings)
-
-        def write(self, values: object, step: int) -> None: ...
-
-        def close(self) -> None: ...
-
-    monkeypatch.setattr("nexwarp.run.log.WandbSink", Sink)
-    source, run, own = SceneSource(str(tiny_scene.path)), tmp_path / "run", OwnTeachers(2, 4, 240)
-    create_run(run, RunRecord(source, CONFIG, own=own))
-    record = RunRecord(source, CONFIG, own=own)
-    session = Session(run, record, Console(quiet=True), Ranks.alone(CPU), sinks=["wandb"])
-    stage_runner(tiny_scene, CONFIG, CPU, session, own=own).train()
-    assert given == [CONFIG.as_dict()]
 
 
 def test_files_are_of_teachers_only_where_the_run_says_so(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from nexwarp.errors import CheckpointError
 from nexwarp.model.exposures import Exposures
 from nexwarp.train.checkpoint import CHECKPOINTS
 from nexwarp.train.recipe import TextureConfig
-from nexwarp.train.teachers import TaughtTargets
 from tests.ranks_support import alone_as
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -96,23 +95,6 @@ def test_photos_and_cameras_near_each_have_their_turn_once_in_a_round(tiny_scene
     assert len(orders) == 3
 
 
-def test_choices_follow_from_seed_and_number_alone(tiny_scene: Scene, teachers: list[Model]) -> None:
-    def targets(seed: int) -> TaughtTargets:
-        made = Trainer(tiny_scene, dataclasses.replace(CONFIG, seed=seed), CPU, teachers=teachers).targets
-        assert isinstance(made, TaughtTargets)
-        return made
-
-    one, other = targets(0), targets(0)
-    numbers = [98, 4, 2, 40, 98]
-    forward = {number: one.choice(number) for number in sorted(numbers)}
-    for number in numbers:
-        index, camera, model = other.choice(number)
-        assert index == forward[number][0] and model is forward[number][2]
-        assert torch.equal(camera.viewmat, forward[number][1].viewmat)
-    seeded = targets(5)
-    assert any(not torch.equal(seeded.choice(n)[1].viewmat, one.choice(n)[1].viewmat) for n in numbers)
-
-
 def test_ranks_share_the_turns_of_one_process(tiny_scene: Scene, teachers: list[Model]) -> None:
     """Whatever their number: the target of each number is that of a training on one GPU, but for random numbers."""
     alone = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
@@ -144,12 +126,6 @@ def test_what_belongs_to_a_photo_does_not_count(tiny_scene: Scene, teachers: lis
         assert taught.expected is not None and not taught.expected.any()
 
 
-def test_teachers_stay_as_they_are(tiny_scene: Scene, teachers: list[Model]) -> None:
-    before = [{name: x.clone() for name, x in model.state_dict().items()} for model in teachers]
-    nw.train(tiny_scene, CONFIG, device=CPU, teachers=teachers)
-    assert all(same(old, model.state_dict()) for old, model in zip(before, teachers, strict=True))
-
-
 def test_a_resumed_student_has_the_bits_of_an_uninterrupted_one(
     tiny_scene: Scene, teachers: list[Model], tmp_path: Path
 ) -> None:
@@ -178,19 +154,6 @@ def test_a_checkpoint_of_other_teachers_is_refused(
     begun.save_checkpoint(tmp_path)
     with pytest.raises(CheckpointError, match="learned from other teachers"):
         Trainer(tiny_scene, CONFIG, CPU, teachers=others).restore(tmp_path)
-
-
-def test_teachers_given_to_a_run_without_are_refused(tiny_scene: Scene, teachers: list[Model], tmp_path: Path) -> None:
-    begun = Trainer(tiny_scene, CONFIG, CPU)
-    begun.run(until=3)
-    begun.save_checkpoint(tmp_path)
-    with pytest.raises(CheckpointError, match="learned from other teachers"):
-        Trainer(tiny_scene, CONFIG, CPU, teachers=teachers).restore(tmp_path)
-
-
-def test_learned_poses_are_refused(tiny_scene: Scene, teachers: list[Model]) -> None:
-    with pytest.raises(ValueError, match="teachers: expected refine_poses=False"):
-        Trainer(tiny_scene, dataclasses.replace(CONFIG, refine_poses=True), CPU, teachers=teachers)
 
 
 def test_teachers_of_another_scene_are_refused(tiny_scene: Scene, teachers: list[Model]) -> None:
