@@ -67,17 +67,11 @@ class PoseCorrections(nn.Module):
     surfels changes no rendering (the gauge). `keep_gauge` removes from the corrections what is such a common motion, to
     first order, so that the corrected cameras stay where the given ones are, and with them the test cameras.
 
-    Attributes:
-        corrections: (V, 6) parameter, axes of the cameras' frames: radians, and shifts in units of `scale`.
-        scale: world units.
-
-    Buffers, not saved:
-        gauge: (6 V, G) orthonormal directions that change no rendering, G <= 7.
-        pivots: (V,) z-depths of the points about which the corrections turn, world units.
+    The parameter `corrections` (V, 6) has radians, and shifts in units of `scale`, along the axes of the cameras.
     """
 
-    gauge: torch.Tensor
-    pivots: torch.Tensor
+    gauge: torch.Tensor  # (6 V, G) orthonormal directions that change no rendering, G <= 7; not saved
+    pivots: torch.Tensor  # (V,) z-depths of the points about which the corrections turn, world units; not saved
 
     def __init__(self, cameras: Sequence[Camera], scale: float, depths: Sequence[float] | None = None) -> None:
         """Start with no correction; `depths` are V typical z-depths of what the cameras see, None is `scale`."""

@@ -100,10 +100,8 @@ class NeuralTexture(nn.Module):
                 raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
             check_range(name, value, low, LARGEST_RESOLUTION)
         for name, flag in flags.items():
-            if name not in TextureFlags.__annotations__:
-                raise TypeError(f"{name}: expected an argument of NeuralTexture")
-            if not isinstance(flag, bool):
-                raise TypeError(f"{name}: expected True or False, got {flag!r}")
+            if name not in TextureFlags.__annotations__ or not isinstance(flag, bool):
+                raise TypeError(f"{name}: expected residual or down_weighting, True or False, got {flag!r}")
         self.config: TextureShape = {
             "levels": levels,
             "table_size": table_size,
@@ -136,8 +134,8 @@ class NeuralTexture(nn.Module):
     def stored_per_point(self, sh_degree: int) -> tuple[int, torch.dtype]:
         """Return how many values an evaluation up to an SH degree keeps for each point, at least, and their dtype.
 
-        Features, hidden layers and output; without gradients no hidden layers. Fused kernels keep the features alone.
-        Without gradients, those keep nothing, nor does a CPU, which evaluates part of the points at a time.
+        Features, output and, for gradients, hidden layers. Fused kernels keep features alone, for gradients alone; a
+        CPU without gradients evaluates part of the points at a time.
         """
         *hidden, last = self.mlp.parameters()
         features, outputs = self.grid.shape[0] * self.grid.shape[2], 3 * (min(sh_degree, self.sh_degree) + 1) ** 2
@@ -201,18 +199,9 @@ class NeuralTexture(nn.Module):
         sh_degree: int = 3,
         clamp: bool = False,
     ) -> torch.Tensor:
-        """Return the textured colours of hits: 0.5 + SH(direction), or SH(direction) if `residual`.
+        """Return the textured colours (..., K, 3) of hits: 0.5 + SH(direction), or SH(direction) if `residual`.
 
-        Args:
-            positions: (..., K, 3) hit points, world frame.
-            depths: (..., K) their z-depths, 0 in empty slots.
-            directions: (..., 3) unit ray directions, world frame.
-            focal: focal length in pixels, a number or a tensor of one element.
-            sh_degree: largest SH degree to evaluate.
-            clamp: clamp colours to >= 0.
-
-        Returns:
-            (..., K, 3) colours.
+        Points (..., K, 3) and unit directions (..., 3) are in the world frame; depths (..., K) are 0 in empty slots.
         """
         degree = min(sh_degree, self.sh_degree)
         flat = directions.reshape(-1, 3)
@@ -233,11 +222,7 @@ class NeuralTexture(nn.Module):
         if not self.down_weighting:
             focal = FOCAL_WITHOUT_DOWN_WEIGHTING
         if isinstance(focal, torch.Tensor):
-            if focal.numel() != 1:
-                raise ValueError(f"focal: expected one element, got shape {tuple(focal.shape)}")
             focal = focal.detach().to(self.grid).reshape(1)
-        elif isinstance(focal, bool) or not isinstance(focal, (int, float)):
-            raise TypeError(f"focal: expected a number or a tensor, got {type(focal).__name__}")
         else:
             focal = self.grid.new_full((1,), float(focal))
         table = self.half_copy() if self._in_half() and self._half_copy is not None else None
