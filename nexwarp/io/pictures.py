@@ -61,17 +61,11 @@ def _save(path: str | os.PathLike[str], image: torch.Tensor, **options: Any) -> 
 def save_exr(
     path: str | os.PathLike[str], parts: Mapping[str, torch.Tensor], metadata: Mapping[str, object] | None = None
 ) -> None:
-    """Write tensors losslessly as the named parts of one OpenEXR file: float32 as FLOAT, int32 as UINT.
+    """Write tensors losslessly as the named parts of one OpenEXR file, atomically.
 
-    Args:
-        path: the file, written atomically.
-        parts: name -> (H, W, 3) float32 (channels R, G, B), (H, W) float32 (channel Y) or (H, W) int32 (channel Y; -1
-            becomes 4294967295).
-        metadata: values that JSON can hold. They become the text attribute `nexwarp` of the first part, together with
-            the list `parts` of all part names.
-
-    Raises:
-        TypeError, ValueError: a part of another shape or dtype; OSError: `path` cannot be written.
+    A part is (H, W, 3) float32 (channels R, G, B), (H, W) float32 (channel Y) or (H, W) int32 (UINT channel Y; -1
+    becomes 4294967295). The metadata, which JSON can hold, become the text attribute `nexwarp` of the first part,
+    together with the list `parts` of all names. TypeError, ValueError: a part of another shape or dtype.
     """
     import OpenEXR
 
@@ -97,14 +91,9 @@ def save_exr(
 
 
 def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Read a file of `save_exr`; the tensors have the same bits.
+    """Read the parts of a file of `save_exr`, bit for bit, and its metadata, with the entry `parts`.
 
-    Returns:
-        The parts by name, on the CPU, and the metadata; its entry `parts` lists the part names.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: the file is not OpenEXR, is damaged, or has other channels than `save_exr` writes.
+    FileNotFoundError: no such file. FormatError: it is not OpenEXR, damaged, or has other channels than `save_exr` has.
     """
     import OpenEXR
 

@@ -23,34 +23,23 @@ MODES = {
     "weights": "Blending weight of the hit.",
     "normal": "Normal of the hit's surfel, facing the camera; world x, y, z as red, green, blue.",
     "alpha": "1 - transmittance after the last surfel.",
-    "hit count": f"Number of hits with a weight of at least 2 %, among the {MAX_HITS} heaviest of each pixel.",
 }
 TEXTURED = ("image", "textured")  # modes that need the neural texture
 BY_SLOT = ("ids", "depth", "weights", "normal")  # modes that show one of the K hits
-COUNTED = 0.02  # smallest weight that "hit count" counts; nearly all pixels have more than 8 hits in total
 QUANTILE_SAMPLES = 100_000
 RANGES = {"max_hits": (0, MAX_HITS), "sh_degree": (0, MAX_SH_DEGREE), "slot": (1, MAX_HITS)}
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Display settings of one client.
+    """Display settings of one client."""
 
-    Attributes:
-        mode: a key of `MODES`.
-        max_hits: K, 0 to 8.
-        sh_degree: largest SH degree.
-        slot: rank of the hit that the modes of `BY_SLOT` show, 1 (heaviest) to 8.
-        as_trained: weight the texture's levels as at the photos' resolution where the picture's is finer.
-        photo_exposure: use the exposure of the nearby photos instead of the mean exposure.
-    """
-
-    mode: str = "image"
+    mode: str = "image"  # a key of `MODES`
     max_hits: int = 2
     sh_degree: int = MAX_SH_DEGREE
-    slot: int = 1
-    as_trained: bool = True
-    photo_exposure: bool = True
+    slot: int = 1  # rank of the hit that the modes of `BY_SLOT` show, 1 (heaviest) to 8
+    as_trained: bool = True  # weight the texture's levels as at the photos' resolution where the picture's is finer
+    photo_exposure: bool = True  # use the exposure of the nearby photos instead of the mean exposure
 
     def changed(self, name: str, value: object) -> "Settings":
         """Return these settings with a value that a browser sent, clamped to its range; ValueError for another type."""
@@ -81,8 +70,6 @@ def draw(
     mode, hits = settings.mode, settings.max_hits
     if mode in BY_SLOT:
         hits = max(hits, settings.slot)
-    elif mode == "hit count":
-        hits = MAX_HITS
     if mode not in TEXTURED:
         model = Model(model.surfels, None, model.exposures, model.detail_limits, model.options)
     degree = min(settings.sh_degree, model.options.sh_degree)
@@ -97,7 +84,7 @@ def draw(
     if mode == "depth":
         span = _depth_span(torch.cat([part[~part.isnan()] for part in parts]))
     elif parts[0].ndim == 2:
-        span = (0.0, float(MAX_HITS)) if mode == "hit count" else (0.0, 1.0)
+        span = (0.0, 1.0)
     # Band by band: temporary tensors of a large picture would need several times its memory.
     return Picture(np.concatenate([_pixels(part, span) for part in parts]), span)
 
@@ -107,9 +94,6 @@ def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings
     mode, slot = settings.mode, settings.slot - 1
     if mode in ("image", "plain", "textured", "alpha"):
         return getattr(out, mode)
-    if mode == "hit count":
-        count = (out.weights >= COUNTED).sum(dim=2).to(out.weights)
-        return count.masked_fill(count == 0, torch.nan)
     ids = out.ids[..., slot].long()
     if mode in ("weights", "depth"):
         values = out.weights if mode == "weights" else out.depths

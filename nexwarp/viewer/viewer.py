@@ -15,7 +15,6 @@ import torch
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import surrounding
 from nexwarp.io.files import one_line
-from nexwarp.kernels.types import MAX_HITS
 from nexwarp.model.model import Model
 from nexwarp.viewer import pacing
 from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
@@ -35,21 +34,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ViewerOptions:
-    """Options of a viewer.
+    """Options of a viewer."""
 
-    Attributes:
-        near: near depth of the viewer's cameras, world units.
-        title: text above the panel.
-        host: interface to listen on.
-        port: port to listen on; 0 is any free port.
-        total: number of iterations of the training that is shown; None for a finished model.
-    """
-
-    near: float
-    title: str = "nexwarp"
-    host: str = "127.0.0.1"
-    port: int = 8080
-    total: int | None = None
+    near: float  # near depth of the viewer's cameras, world units
+    title: str = "nexwarp"  # text above the panel
+    host: str = "127.0.0.1"  # interface to listen on
+    port: int = 8080  # 0 is any free port
+    total: int | None = None  # iterations of the training that is shown; None for a finished model
 
 
 class Viewer:
@@ -64,7 +55,7 @@ class Viewer:
         photos: Mapping[str, Callable[[], torch.Tensor]] | None = None,
         save_path: Callable[[Sequence[Camera]], str] | None = None,
     ) -> None:
-        """Start the server.
+        """Start the server. ValueError: the package viser is missing, or the address cannot be used.
 
         Args:
             model: returns the current model; called for each picture.
@@ -72,9 +63,6 @@ class Viewer:
             options: title, address and the like.
             photos: "set/name" -> function that returns the (H, W, 3) uint8 photo, for thumbnails.
             save_path: writes a camera path into the run and returns the command that renders it; None offers none.
-
-        Raises:
-            ValueError: the package viser is missing, or the address cannot be used.
         """
         self.model, self.options, self.save_path = model, options, save_path
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
@@ -124,15 +112,10 @@ class Viewer:
             self._draw_or_wait()
 
     def between_steps(self, step: int, describe: Callable[[], str], stop: Callable[[], bool] = lambda: False) -> None:
-        """Draw pictures between two steps of a training; call it after each step.
+        """Draw pictures after `step` iterations of a training; `describe` returns a status line.
 
         It costs nothing without connected browsers. While the training is paused, it returns only when the training is
         resumed or `stop()` returns True. Errors of the viewer are logged: they do not end the training.
-
-        Args:
-            step: number of finished iterations.
-            describe: returns a status line; called from time to time while a browser is connected.
-            stop: ends a pause.
         """
         self.step = step
         if self.training is None or not (self.sessions or self.training.paused):
@@ -322,7 +305,7 @@ class Viewer:
 
 def _kind(settings: Settings) -> tuple[bool, int]:
     """Kind of a picture for `Pace`: the settings that decide the cost of a pixel."""
-    return settings.mode in TEXTURED, MAX_HITS if settings.mode == "hit count" else settings.max_hits
+    return settings.mode in TEXTURED, settings.max_hits
 
 
 def _reason(error: Exception) -> str:

@@ -113,13 +113,6 @@ def untextured_image(model: nw.Model, camera: nw.Camera) -> torch.Tensor:
     return model.bare(max_hits=0).render(camera).image.detach()
 
 
-def test_a_model_without_texture_bakes_to_itself(model, cameras):
-    bare = model.bare(max_hits=0)
-    camera = cameras["0.png"]
-    image = bake(bare, list(cameras.values()), steps=0).render(camera)
-    assert_close(image, untextured_image(model, camera), kind="value", name="image")
-
-
 def test_codes_are_near_the_values(baked):
     codes, scale = encode_atlas(baked.atlas)
     inside = baked.atlas.clamp(-scale, scale)
@@ -167,13 +160,6 @@ def test_the_gltf_file_holds_the_surfels(baked, cameras, tmp_path):
     size = struct.unpack("<I", file.read_bytes()[12:16])[0]
     (material,) = json.loads(file.read_bytes()[20 : 20 + size])["materials"]
     assert material["alphaMode"] == "MASK" and "KHR_materials_unlit" in material["extensions"]
-
-
-def test_up_becomes_y(cameras):
-    turn = upright(list(cameras.values()))
-    assert np.allclose(turn @ turn.T, np.eye(3)) and np.linalg.det(turn) > 0
-    ups = np.stack([-camera.viewmat[1, :3].numpy() for camera in cameras.values()])
-    assert np.allclose(turn @ (ups.mean(0) / np.linalg.norm(ups.mean(0))), [0, 1, 0], atol=1e-6)
 
 
 def test_spz_files_hold_the_gaussians(model, tmp_path):

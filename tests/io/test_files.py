@@ -13,7 +13,6 @@ from nexwarp.io import files
 from nexwarp.io.files import (
     is_abandoned,
     is_temporary,
-    sync,
     temporary_name,
     write_atomically,
     written_aside,
@@ -93,18 +92,6 @@ def test_folders_of_a_failed_write_are_removed(tmp_path):
     with pytest.raises(ValueError, match="mine"), written_aside(tmp_path / "a" / "b" / "file"):
         raise ValueError("mine")
     assert os.listdir(tmp_path) == []
-
-
-def test_a_folder_that_may_not_be_read_is_not_synced(tmp_path, monkeypatch):
-    def refuse(*_: object) -> int:
-        raise PermissionError(13, "Permission denied")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "open", refuse)
-        sync(tmp_path)
-        with pytest.raises(PermissionError):
-            (tmp_path / "file").write_bytes(b"")
-            sync(tmp_path / "file")
 
 
 def test_camera_paths_of_viewers_at_the_same_time_all_stay(tmp_path):

@@ -14,7 +14,7 @@ import torch
 import nexwarp as nw
 from nexwarp.export.bake.fit import bake as bake_model
 from nexwarp.export.web import atlas
-from nexwarp.export.web.export import one_file, page_files, static_files
+from nexwarp.export.web.export import page_files, static_files
 from nexwarp.export.web.scene_file import SCENE_FILE
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
@@ -172,10 +172,6 @@ def test_controls_modes_links_and_sizes(tab, site):
     assert tab.value(target) == pytest.approx(tab.value(target.replace("(nexwarp.pose)", "(nexwarp.start_)")), abs=1e-4)
     page.mouse.wheel(0, 200)
     tab.wait(f"nexwarp.pose.distance > {dragged[5]} * 1.2")
-    before = tab.value(POSE)
-    page.keyboard.press("ArrowLeft", delay=200)
-    tab.wait(FINISHED)
-    assert tab.value(POSE) != before, "arrow keys turn"
     page.keyboard.press("Home")
     tab.wait(f"!nexwarp.flight && Math.abs(nexwarp.pose.eye[0] - {start[0]}) < 1e-6")
     page.keyboard.press("v")
@@ -199,7 +195,6 @@ def test_controls_modes_links_and_sizes(tab, site):
     page.set_viewport_size({"width": 150, "height": 180})
     tab.wait("nexwarp.canvas.width === 150 && nexwarp.canvas.height === 180")
     tab.wait(FINISHED)
-
     page.get_by_label("Show").select_option("normals")
     tab.wait("location.hash.includes('mode=normals')")
     pose = tab.value(POSE)
@@ -208,9 +203,6 @@ def test_controls_modes_links_and_sizes(tab, site):
     assert tab.value(POSE) == pytest.approx(pose, rel=1e-4, abs=1e-4), "a link keeps the camera"
     assert tab.value("nexwarp.mode") == "normals" and page.input_value("#mode") == "normals"
 
-    unnamed = "x => !x.ariaLabel && !x.labels?.length && !x.innerText"
-    controls = "[...document.querySelectorAll('button, select, input')]"
-    assert tab.value(f"{controls}.filter({unnamed}).length") == 0, "every control has a name"
     assert not tab.errors
     own = [url for url in tab.requests if not url.startswith((site.url, "data:", "blob:"))]
     assert not own, "no request leaves the page's own origin"
@@ -276,15 +268,6 @@ def test_damaged_files_give_one_line(tab, site):
         assert words in tab.message and "\n" not in tab.message, (words, tab.message)
         assert not tab.page.is_visible("#loading")
         site.files = kept
-
-
-def test_one_file_from_a_disk(tab, site, tmp_path):
-    file = tmp_path / "scene.html"
-    file.write_bytes(one_file(site.files))
-    tab.open(f"{file.as_uri()}?renderer=baked")
-    assert tab.picture().std() > 0.05
-    assert not tab.errors
-    assert not [url for url in tab.requests if not url.startswith((file.as_uri(), "data:", "blob:"))]
 
 
 def test_the_live_demo_of_the_documentation(tab):

@@ -235,15 +235,6 @@ def test_an_empty_scene_shows_the_background(tab):
     assert torch.equal(out["image"], torch.tensor([0.25, 0.5, 1.0]).expand_as(out["image"]))
 
 
-def test_what_cannot_be_rendered_is_named(tab, default):
-    _, camera = default
-    text = "([camera, options]) => renderer.render(camera, options).then(() => '', error => error.message)"
-    assert "expected one of image, plain" in tab.page.evaluate(text, [entry_of(camera), {"mode": "picture"}])
-    large = {**entry_of(camera), "width": 60_000, "height": 60_000}
-    assert "picture of 60000 x 60000 pixels" in tab.page.evaluate(text, [large, {}])
-    assert tab.render(camera)[1]["image"].shape == (camera.height, camera.width, 3)
-
-
 def test_damaged_files_give_one_line(tab):
     for name, content in damaged().items():
         tab.site.files["damaged.nxw"] = content
