@@ -19,7 +19,7 @@ def compose_kernels(real: type) -> SimpleNamespace:
     t = types(real)
     vec3, ONE = t.vec3, t.ONE
 
-    @wp.kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def compose(
         first: wp.int32,
         plain: wp.array(dtype=vec3),

@@ -54,7 +54,7 @@ def project_kernels(real: type) -> SimpleNamespace:
     t = types(real)
     vec2, vec3, vec4, mat44 = t.vec2, t.vec3, t.vec4, t.mat44
 
-    @wp.kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def project(
         first: wp.int32,
         means: wp.array(dtype=vec3),

@@ -40,7 +40,7 @@ def unproject_kernels(real: type) -> SimpleNamespace:
     t = types(real)
     vec3, mat33, mat44 = t.vec3, t.mat33, t.mat44
 
-    @wp.kernel(module="unique")
+    @wp.kernel(enable_backward=False, module="unique")
     def unproject(
         first: wp.int32,
         depths: wp.array2d(dtype=real),

@@ -46,12 +46,6 @@ _STORE_ROW = """
     reinterpret_cast<float4*>(records.data)[4u * (unsigned)i + j] = make_float4(row.c[0], row.c[1], row.c[2], row.c[3]);
 """
 
-# Gradients of arrays are in the arrays themselves on a tape, and else in an array of their own.
-_ADJOINT_STORE = """
-    if (records.grad) adj_row += records.grad[4 * (size_t)i + j];
-    else if (adj_records.data) adj_row += adj_records.data[4 * (size_t)i + j];
-"""
-
 
 @functools.cache
 def load_function(length: int, scalar: type) -> wp.Function:
@@ -88,12 +82,12 @@ def load_record(records: Any, i: wp.int32):
 
 @for_both_reals
 def store_record_row(real: type) -> wp.Function:
-    """Write row j of the record i; differentiable."""
+    """Write row j of the record i."""
     row_type = wp.types.vector(length=4, dtype=real)
     exact = "records.data[4 * (size_t)i + j] = row;"
     text = snippet(_STORE_ROW, exact) if real is wp.float32 else exact
 
-    @wp.func_native(text, adj_snippet=_ADJOINT_STORE)
+    @wp.func_native(text)
     def store_record_row(records: wp.array2d(dtype=row_type), i: wp.int32, j: wp.int32, row: row_type): ...
 
     return store_record_row

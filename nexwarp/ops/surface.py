@@ -60,11 +60,16 @@ def surface(
         viewmat: (4, 4) world to camera.
     """
     scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera)
-    expected, median, top, sums = _Surface.apply(projection.records, scene, hits.stops)
+    expected, median, top, sums = walk_surface(projection.records, scene, hits.stops)
     with torch.autocast(sums.device.type, enabled=False):
         blended = sums @ viewmat[:3, :3].to(sums)
         normals = torch.nn.functional.normalize(blended, dim=-1)
     return DifferentiableSurface(expected, median, top, normals, blended)
+
+
+def walk_surface(records: torch.Tensor, scene: Walked, stops: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """(expected, median, top) depths, and the sum of weight * normal in the camera's frame, (H, W, 3)."""
+    return _Surface.apply(records, scene, stops)
 
 
 class _Context(Context):

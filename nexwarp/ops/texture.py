@@ -76,7 +76,7 @@ class _Texture(torch.autograd.Function):
     def forward(
         ctx: _Context, points: Points, field: Field, rays: Rays | None, keep: bool, *tensors: torch.Tensor | None
     ) -> torch.Tensor:
-        lookup = _Lookup(points, field.stored(), field.resolutions)
+        lookup = Lookup(points, field.stored(), field.resolutions)
         matrices = [w.to(lookup.table.dtype) for w in field.weights]
         encoded = lookup.features()
         with torch.autocast(encoded.device.type, enabled=False):
@@ -92,7 +92,7 @@ class _Texture(torch.autograd.Function):
         if rays is None:
             return coefficients[:, : len(points)].to(field.grid.dtype)
         colors = torch.empty_like(points.positions)
-        kernels, arguments = _color_kernels(coefficients, rays, len(points))
+        kernels, arguments = color_kernels(coefficients, rays, len(points))
         launch(colors, kernels.forward, len(points), arguments, [array(colors, types(real_of(colors)).vec3)])
         return colors
 
@@ -110,11 +110,11 @@ class _Texture(torch.autograd.Function):
             signal[:, : len(positions)] = grad * scale
         else:
             rays = replace(ctx.rays, directions=directions)
-            grad_directions = _colors_backward(signal, coefficients, rays, grad.contiguous(), scale, need_directions)
+            grad_directions = colors_backward(signal, coefficients, rays, grad.contiguous(), scale, need_directions)
         unscale = scale.reciprocal()
         with torch.autocast(grad.device.type, enabled=False):
             signal, grad_matrices = mlp.outputs_backward(signal, layers, matrices)
-        lookup = _Lookup(Points(positions, depths, focal), table, resolutions)
+        lookup = Lookup(Points(positions, depths, focal), table, resolutions)
         grad_grid, grad_points = lookup.backward(signal.contiguous(), unscale, need_positions or need_depths)
         return (
             *(None,) * 4,
@@ -127,7 +127,7 @@ class _Texture(torch.autograd.Function):
 
 
 @dataclass(frozen=True)
-class _Lookup:
+class Lookup:
     """The lookup of points in a table (L, T, F)."""
 
     points: Points
@@ -198,7 +198,8 @@ def _units(grad_encoded: torch.Tensor, unscale: torch.Tensor) -> torch.Tensor:
     return torch.exp2(torch.floor(torch.log2(2.0**46 / largest.clamp_min(1e-200)))).view(1)
 
 
-def _color_kernels(coefficients: torch.Tensor, rays: Rays, count: int) -> tuple[Any, list[Argument]]:
+def color_kernels(coefficients: torch.Tensor, rays: Rays, count: int) -> tuple[Any, list[Argument]]:
+    """The kernels of colours along rays, and the arguments that both begin with."""
     real, storage = real_of(rays.directions), STORAGES[coefficients.dtype]
     if len(coefficients) not in OUTPUTS:
         raise ValueError(f"weights: expected 3 (d + 1)^2 outputs with d of 0 to 3, got {len(coefficients)}")
@@ -207,7 +208,7 @@ def _color_kernels(coefficients: torch.Tensor, rays: Rays, count: int) -> tuple[
     return kernels, [array(coefficients, storage), array(rays.directions, types(real).vec3), hits, rays.offset]
 
 
-def _colors_backward(
+def colors_backward(
     signal: torch.Tensor,
     coefficients: torch.Tensor,
     rays: Rays,
@@ -219,7 +220,7 @@ def _colors_backward(
     real = real_of(rays.directions)
     vec3, count = types(real).vec3, len(grad_colors)
     slots = grad_colors.new_zeros(count if need_directions else 0, 3)
-    kernels, arguments = _color_kernels(coefficients, rays, count)
+    kernels, arguments = color_kernels(coefficients, rays, count)
     arguments += [array(scale, real), array(grad_colors, vec3)]
     outputs = [array(signal, STORAGES[coefficients.dtype]), array(slots, vec3)]
     launch(grad_colors, kernels.backward, count, arguments, outputs)
