@@ -34,7 +34,7 @@ from nexwarp.io.files import (
     sync,
     written_aside,
 )
-from nexwarp.io.json_files import READ_ERRORS, Json, parse_json, read_json, write_json
+from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
 from nexwarp.model.model_file import MODEL_FILE
 from nexwarp.train.checkpoint import CHECKPOINT_FILES, CHECKPOINTS
 from nexwarp.train.recipe import MIN_SURFELS, MOST_TEACHERS, Config
@@ -97,7 +97,7 @@ OURS = re.compile(
 
 RUN_VERSION = 1  # of config.json and metrics.json; a file without `format_version` has version 1
 WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
-MAX_HOLDER = 1000  # bytes of the record of a lock's holder that are read
+MAX_HOLDER = 300  # bytes of the record of a lock's holder that are read
 
 
 @dataclass(frozen=True)
@@ -138,19 +138,14 @@ def _own_teachers(data: object) -> OwnTeachers:
     if data is None:
         return NO_TEACHERS
     values = data if isinstance(data, dict) else {}
-    count, iterations = values.get("count"), values.get("iterations")
-    surfels = values.get("max_surfels")  # None for runs from before teachers had a budget of their own
-    if (
-        type(count) is not int
-        or type(iterations) is not int
-        or type(surfels) not in (int, type(None))
-        or not 0 <= count <= MOST_TEACHERS
-        or iterations < min(count, 1)
-        or (surfels is not None and surfels < MIN_SURFELS)
-    ):
-        expected = f"a count of 0 to {MOST_TEACHERS}, iterations, and max_surfels of at least {MIN_SURFELS}"
+    # Runs from before teachers had a budget of their own do not name one.
+    own = OwnTeachers(values.get("count", 0), values.get("iterations", 0), values.get("max_surfels"))
+    numbers = (own.count, own.iterations, MIN_SURFELS if own.max_surfels is None else own.max_surfels)
+    least = (1, 1, MIN_SURFELS)
+    if any(type(n) is not int or n < low for n, low in zip(numbers, least, strict=True)) or own.count > MOST_TEACHERS:
+        expected = f"a count of 1 to {MOST_TEACHERS}, iterations, and max_surfels of at least {MIN_SURFELS}"
         raise ValueError(f"own_teachers: expected {expected}, got {data!r:.60}")
-    return OwnTeachers(count, iterations, surfels)
+    return own
 
 
 def read_run(run: Path) -> RunRecord:
@@ -260,8 +255,9 @@ def _acquire(lock: BaseFileLock, run: Path, warn: Callable[[str], None]) -> None
     try:
         lock.acquire()
     except Timeout:
+        holder = one_line(path.read_bytes()[:MAX_HOLDER].decode(errors="replace")) or "another process"
         raise RunError(
-            f"{run}: expected a run folder that no other process writes to, but {_holder(path)} does; "
+            f"{run}: expected a run folder that no other process writes to, but {holder} does; "
             "wait until it ends, or give another run folder"
         ) from None
     except OSError as error:
@@ -275,17 +271,7 @@ def _write_holder(file: int) -> None:
     """Write who holds a lock into its open file."""
     since = datetime.now().astimezone().isoformat(" ", "seconds")
     os.ftruncate(file, 0)
-    os.write(file, (json.dumps({"process": os.getpid(), "host": node(), "since": since}) + "\n").encode())
-
-
-def _holder(path: Path) -> str:
-    """Describe the holder of a lock: its process, host and time."""
-    try:
-        with path.open("rb") as file:
-            record = parse_json(str(path), file.read(MAX_HOLDER))
-        return one_line(f"process {record['process']} on {record['host']}, since {record['since']},")
-    except READ_ERRORS:  # the holder has not written it yet
-        return "another process"
+    os.write(file, f"process {os.getpid()} on {node()}, since {since},".encode())
 
 
 def create_run(run: Path, record: RunRecord) -> list[str]:

@@ -79,13 +79,6 @@ def test_training_says_what_it_does(scene, tmp_path, capsys):
     assert nw.load(run).options.max_hits == 0
 
 
-def test_default_run_folder_is_named_after_the_scene(scene, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(["train", str(scene), *FLAGS, "--iterations", "1", "--downscale", "2"]) == 0
-    assert {f.name for f in Path("runs", "tiny").iterdir()} == RUN_FILES - {"checkpoint.old"}
-    assert picture(Path("runs/tiny/renders/test/view_000.png")).shape == (18, 24, 3)
-
-
 # eval, render, info
 
 

@@ -14,9 +14,7 @@ import warp as wp
 
 from nexwarp.kernels import launch as launching
 from nexwarp.run import warmup
-from nexwarp.train.densify import Densifier
 from nexwarp.train.recipe import PRESETS, Config
-from nexwarp.train.trainer import Trainer
 
 CPU = torch.device("cpu")
 
@@ -105,26 +103,3 @@ def test_keys_of_kernels_do_not_depend_on_what_was_compiled_before(name: str, mo
     assert len(kernels) > 20
     plain = [kernel for kernel in kernels.values() if not kernel.adj.has_unresolved_static_expressions]
     assert not {kernel.key: functions for kernel in plain if (functions := [*late(kernel.adj)])}
-
-
-def test_the_rehearsal_is_a_short_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every degree, rounds of density control, and steps after the last, as in a real run."""
-    steps, rounds = [], []
-    step, split = Trainer.step, Densifier.step
-
-    def noted(self: Trainer) -> Any:
-        progress = step(self)
-        steps.append((self.render_options().sh_degree, self.densifier.active(self.iteration)))
-        return progress
-
-    def counted(self: Densifier, *args: Any) -> Any:
-        rounds.append(split(self, *args))
-        return rounds[-1]
-
-    monkeypatch.setattr(Trainer, "step", noted)
-    monkeypatch.setattr(Densifier, "step", counted)
-    warmup.rehearse(Config(), CPU)
-    degrees, watches = zip(*steps, strict=True)
-    assert set(degrees) == {0, 1, 2, 3} and list(degrees) == sorted(degrees)
-    assert set(watches) == {True, False} and list(watches) == sorted(watches, reverse=True)
-    assert any(count for count, _ in rounds), "nothing was split"

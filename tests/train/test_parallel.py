@@ -242,19 +242,6 @@ def test_a_killed_rank_ends_all_and_the_run_resumes(tiny_folder: Path, tmp_path:
     assert (run / MODEL_FILE).read_bytes() == (whole / MODEL_FILE).read_bytes()
 
 
-def test_a_signal_to_one_rank_ends_all(tiny_folder: Path, tmp_path: Path, small_default: None) -> None:
-    run = tmp_path / "run"
-    arguments = ["train", str(tiny_folder), "--run", str(run), *TRAIN, "--iterations", "4000"]
-    processes = start_ranks(2, lambda _: cli.main(arguments), tmp_path / "a")
-    until = time.monotonic() + 60
-    while not has_checkpoint(run) and time.monotonic() < until:
-        time.sleep(0.005)
-    assert processes[1].pid is not None
-    os.kill(processes[1].pid, signal.SIGTERM)
-    assert wait(processes) == [128 + signal.SIGTERM] * 2
-    assert printed(tmp_path / "a") == ["nexwarp: terminated; continue with --resume"]
-
-
 def test_many_gradients_are_summed_after_the_graph() -> None:
     """61 numbers a surfel less its error are 60; the grid counts only where hits are textured."""
     surfels, texture = make_surfels(random_scene(3)), NeuralTexture(levels=2, table_size=2**10, features=4)

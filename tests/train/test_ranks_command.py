@@ -103,32 +103,6 @@ def test_an_error_is_told_once(tiny_folder: Path, tmp_path: Path) -> None:
     assert line.startswith(f"nexwarp: error: {run}: expected a new run folder") and process.returncode == 2
 
 
-def test_a_run_goes_on_with_any_number_of_ranks(tiny_folder: Path, tmp_path: Path) -> None:
-    """Two ranks begin, one goes on, three end; the model is as good as that of one."""
-    run, alone = tmp_path / "run", tmp_path / "alone"
-    options = ["--iterations", "600", "--checkpoint-every", "60"]
-    begun = ["train", str(tiny_folder), "--run", str(run)]
-    reached: list[int] = []
-    for count, more in ((2, [*TRAIN, *options]), (1, ["--device", "cpu", "--resume"])):
-        process = start([*begun, *more, "--gpus", str(count)])
-        before = reached[-1] if reached else 0
-        until = time.monotonic() + 300
-        while time.monotonic() < until:
-            time.sleep(0.05)
-            if has_checkpoint(run) and load_checkpoint(run)[1]["iteration"] > before:
-                break
-        process.send_signal(signal.SIGTERM)
-        assert lines(process) == ["nexwarp: terminated; continue with --resume"]
-        reached.append(load_checkpoint(run)[1]["iteration"])
-    assert 0 < reached[0] < reached[1] < 600, reached
-    process = start([*begun, "--device", "cpu", "--resume", "--gpus", "3"])
-    assert lines(process) == [] and process.returncode == 0
-    assert not lines(start(["train", str(tiny_folder), "--run", str(alone), *TRAIN, *options]))
-    told, expected = (json.loads((x / "metrics.json").read_text()) for x in (run, alone))
-    assert told["iterations"] == expected["iterations"] == 600
-    assert told["psnr"] > expected["psnr"] - 0.5, (told["psnr"], expected["psnr"])
-
-
 def test_ranks_train_teachers_first(tiny_folder: Path, tmp_path: Path) -> None:
     """And find them again, on all ranks, when the run is resumed."""
     run = tmp_path / "run"

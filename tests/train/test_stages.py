@@ -18,15 +18,12 @@ from nexwarp.cli.session import Session
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.run.folder import RunRecord, create_run, list_files, read_run
-from nexwarp.train import stages as train_stages
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
-from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import TextureConfig
 from nexwarp.train.report import StepReport
 from nexwarp.train.settings import config_from_dict
 from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, stage_runner
-from tests.scene_writers import expose_photos, write_demo
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -124,37 +121,6 @@ def test_train_is_a_training_for_each_stage(tiny_scene: Scene, tmp_path: Path) -
     alone = dataclasses.replace(CONFIG, teachers=0)
     given = nw.train(tiny_scene, CONFIG, device=CPU, teachers=teachers)
     assert same(given, nw.train(tiny_scene, alone, device=CPU, teachers=teachers))
-
-
-@pytest.fixture(scope="module")
-def exposed_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene whose photos differ in exposure; not to be changed."""
-    folder = write_demo(tmp_path_factory.mktemp("scenes") / "demo", width=48, height=36, views=24, points=400)
-    expose_photos(folder)
-    return folder
-
-
-@pytest.fixture
-def calibrations(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
-    """The settings of all trainings whose exposures are estimated."""
-    seen: list[Config] = []
-
-    def calibrate(scene: Scene, config: Config) -> ExposureCalibration | None:
-        seen.append(config)
-        return calibrate_exposures(scene, config)
-
-    monkeypatch.setattr(train_stages, "calibrate_exposures", calibrate)
-    return seen
-
-
-def test_a_run_estimates_exposures_once(exposed_folder: Path, calibrations: list[Config], tmp_path: Path) -> None:
-    """Its models are those of trainings that estimate them for themselves."""
-    scene, config = nw.load_scene(exposed_folder), dataclasses.replace(CONFIG, exposures=True)
-    found = nw.train(scene, config, device=CPU)
-    assert len(calibrations) == 1 and found.exposures is not None
-    *before, student = settings_of(config, OwnTeachers(2, 4, 240))
-    files = [nw.train(scene, each, device=CPU).save(tmp_path / str(each.seed)) for each in before]
-    assert same(found, nw.train(scene, student, device=CPU, teachers=map(nw.load, files)))
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -161,18 +160,6 @@ def test_teachers_of_another_scene_are_refused(tiny_scene: Scene, teachers: list
         other = dataclasses.replace(tiny_scene, scale=factor * tiny_scene.scale)
         with pytest.raises(ValueError, match=r"teachers\[0\]: expected a model of .* whose scale is"):
             nw.train(other, CONFIG, device=CPU, teachers=teachers)
-
-
-def test_what_is_no_list_of_models_is_refused(tiny_scene: Scene, teachers: list[Model]) -> None:
-    given: list[tuple[Any, str]] = [
-        ([teachers[0], "runs/b"], r"teachers\[1\]: expected a nexwarp.Model, got str"),
-        (teachers[0], "teachers: expected a list of models, got one"),
-    ]
-    for wrong, message in given:
-        with pytest.raises(TypeError, match=message):
-            Trainer(tiny_scene, CONFIG, CPU, teachers=wrong)
-    assert Trainer(tiny_scene, CONFIG, CPU, teachers=iter(teachers)).targets.teachers
-    assert not Trainer(tiny_scene, CONFIG, CPU, teachers=[]).targets.teachers
 
 
 def test_the_command_learns_from_runs(
