@@ -39,7 +39,7 @@ from nexwarp.run.log import TrainingLog
 from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.report import StepReport
-from nexwarp.train.stages import Stage
+from nexwarp.train.stages import Stage, StageStore
 from nexwarp.train.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 CHECKPOINTS_A_RUN = 10
 
 
-class Session:
-    """The `StageStore` of a run folder: each stage is trained in a folder of its own.
+class Session(StageStore):
+    """Trains stages in a run folder: each stage is trained in a folder of its own.
 
     A teacher's folder is a run, too: RUN/teachers/1 and so on. The teacher is complete once its metrics.json, which is
     written last, says how long the training took.

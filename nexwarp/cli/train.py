@@ -221,17 +221,14 @@ class Train:
         if self.preset != "default":
             _check_same("--preset", old.config.preset, self.preset)
         config = old.config
-        for name, value in flags.items():
-            if name == "iterations" and isinstance(value, int) and value > config.iterations:
-                config = dataclasses.replace(config, iterations=value)
+        changed = _with_set(with_settings(config, flags), settings)
+        for name in (*flags, *settings):
+            value = setting(changed, name)
+            # The second one does not change the results.
+            if (name == "iterations" and changed.iterations > config.iterations) or name == "cuda_graphs":
+                config = with_settings(config, {name: value})
             else:
-                _check_same(_flag(name), getattr(config, name), value)
-        changed = _with_set(config, settings)
-        for name in settings:
-            if name == "cuda_graphs":  # does not change the results
-                config = dataclasses.replace(config, cuda_graphs=changed.cuda_graphs)
-            else:
-                _check_same(f"--set: {name}", setting(config, name), setting(changed, name))
+                _check_same(_flag(name) if name in flags else f"--set: {name}", setting(config, name), value)
         if self.teachers and old.own.count:
             raise SettingError(f"--teacher: expected none, as the run to resume trains its own, got {self.teachers[0]}")
         source = dataclasses.replace(old.source, path=self.scene.path)

@@ -10,7 +10,7 @@ from nexwarp.model.model import Model
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker
-from nexwarp.train.stages import InMemory, stage_runner
+from nexwarp.train.stages import StageStore, stage_runner
 from nexwarp.train.step_losses import OwnLoss
 
 Callback = Callable[[StepReport], object]
@@ -72,7 +72,7 @@ def train(
     def warn(message: str) -> None:
         warnings.warn(message, stacklevel=2)
 
-    store = InMemory(observe, warn)
+    store = StageStore(observe, warn)
     runner = stage_runner(scene, config, device, store, losses=losses, optimizer=optimizer, teachers=teachers)
     runner.train()
     return runner.finish()

@@ -7,7 +7,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -99,20 +99,38 @@ def divide(config: Config, own: OwnTeachers) -> list[Stage]:
     return [*stages, Stage(student, count, before=taken)]
 
 
-class StageStore(Protocol):
-    """How the stages of a run are trained, and what is kept of them."""
+class StageStore:
+    """How the stages of a run are trained and what is kept of them: here in one go, and nothing on the disk.
+
+    Iterations are reported counted over all stages.
+    """
+
+    def __init__(self, observe: Observer | None = None, warn: Callable[[str], None] = lambda _: None) -> None:
+        self.observe, self.warn = observe, warn
 
     def complete(self, stage: Stage) -> Model | None:
-        """Return the model of a teacher that an earlier session has finished; None where none has."""
+        """Return the model of a teacher that an earlier session has finished; None where there is none."""
+        return None
 
     def begin(self, stage: Stage, trainer: Trainer) -> None:
-        """Prepare a stage, before the first step of its trainer: restore what an earlier session has kept of it."""
+        """Restore what an earlier session has kept of a stage, before its first step."""
 
     def train(self, stage: Stage, trainer: Trainer) -> None:
         """Do all steps of a stage."""
+        trainer.run(self.observe and partial(self._report, stage.before), self.warn)
+
+    def _report(self, before: int, report: StepReport) -> None:
+        assert self.observe is not None
+        self.observe(dataclasses.replace(report, iteration=report.iteration + before) if before else report)
 
     def finish(self, stage: Stage, trainer: Trainer) -> Model:
-        """Return the finished model of a trained stage."""
+        """Return the finished model; a teacher's is rounded as files are: `nexwarp train` reads it from one."""
+        model = trainer.finish()
+        if stage.teacher and model.texture is not None:
+            with torch.no_grad():
+                for parameter in model.texture.parameters():
+                    parameter.copy_(parameter.half())
+        return model
 
 
 class StageRunner:
@@ -166,37 +184,6 @@ class StageRunner:
         return self.store.finish(self.stage, self.trainer)
 
 
-class InMemory:
-    """Trains stages in one go and keeps nothing on the disk; iterations are reported counted over all stages."""
-
-    def __init__(self, observe: Observer | None = None, warn: Callable[[str], None] = lambda _: None) -> None:
-        self.observe, self.warn = observe, warn
-
-    def complete(self, _: Stage) -> Model | None:
-        """Return None: nothing was trained before."""
-        return None
-
-    def begin(self, stage: Stage, trainer: Trainer) -> None:
-        """Do nothing."""
-
-    def train(self, stage: Stage, trainer: Trainer) -> None:
-        """Do all steps of a stage."""
-        trainer.run(self.observe and partial(self._report, stage.before), self.warn)
-
-    def _report(self, before: int, report: StepReport) -> None:
-        assert self.observe is not None
-        self.observe(dataclasses.replace(report, iteration=report.iteration + before) if before else report)
-
-    def finish(self, stage: Stage, trainer: Trainer) -> Model:
-        """Return the finished model; a teacher's is rounded as files are: `nexwarp train` reads it from one."""
-        model = trainer.finish()
-        if stage.teacher and model.texture is not None:
-            with torch.no_grad():
-                for parameter in model.texture.parameters():
-                    parameter.copy_(parameter.half())
-        return model
-
-
 def stage_runner(
     scene: Scene,
     config: Config,
@@ -232,6 +219,6 @@ def stage_runner(
 
 def student_trainer(scene: Scene, config: Config, device: torch.device | str, **options: Any) -> Trainer:
     """Train the teachers of a run, and return the trainer of its student, before its first step."""
-    runner = stage_runner(scene, config, device, InMemory(), **options)
+    runner = stage_runner(scene, config, device, StageStore(), **options)
     runner.train_teachers()
     return runner.trainer
