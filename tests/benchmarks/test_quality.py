@@ -69,14 +69,6 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     torch.set_num_threads(threads)
 
 
-def test_a_training_that_fails_leaves_the_others(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ["train", "--row", "mine:default:{}", "--scenes", "nowhere", "--seeds", "0", "--iterations", "1"]
-    assert main([*command, "--data", str(folder), "--out", str(tmp_path / "out.jsonl")]) == 1
-    assert "scene='nowhere'" in capsys.readouterr().err and not (tmp_path / "out.jsonl").exists()
-
-
 def test_an_unfinished_line_is_cut_off(tmp_path: Path) -> None:
     path = tmp_path / "out.jsonl"
     path.write_text('{"a": 1}\n{"scene": "ti')
@@ -121,13 +113,6 @@ def test_only_marked_blocks_are_filled() -> None:
     for wrong in ("none", page.replace("readme", "another")):
         with pytest.raises(ValueError, match="expected lines <!-- results: NAME -->"):
             fill(wrong, {"readme": "new"})
-
-
-def test_lines_of_other_kinds_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "x.jsonl"
-    path.write_text('{"a": 1}\n')
-    with pytest.raises(ValueError, match=r"x.jsonl, line 1: expected the JSON of a training"):
-        read_results([path])
 
 
 def test_the_documents_have_the_kept_figures(tmp_path: Path) -> None:
