@@ -80,10 +80,8 @@ class Tree:
 class Recorder:
     """Compares a folder with what it was before each call to the file system.
 
-    Attributes:
-        start: what was there in the beginning, all of it on the disk.
-        operations: what has happened since, in order.
-        folders: nodes that are folders.
+    `start` is what was there in the beginning, all of it on the disk; `operations` is what has happened since, in
+    order; `folders` are the nodes that are folders.
     """
 
     def __init__(self, root: Path) -> None:

@@ -72,30 +72,6 @@ assert all(torch.equal(a, b) for a, b in zip(results(), expected)), "the parent 
 print("parent")
 """
 
-CUDA = """
-import os, signal, sys, warnings
-
-warnings.simplefilter("ignore")
-import torch
-
-import nexwarp as nw
-from tests.scenes import make_camera, make_surfels, make_texture, random_scene
-
-scene = random_scene(20, device="cuda")
-surfels, camera, texture = make_surfels(scene), make_camera(scene), make_texture(device="cuda")
-nw.render(surfels, texture, camera).image.sum().item()
-number = os.fork()
-if number == 0:
-    signal.alarm(SECONDS)
-    try:
-        nw.render(surfels, texture, camera)
-    except RuntimeError as error:
-        print(str(error).replace("\\n", " "), flush=True)
-        os._exit(0)
-    os._exit(1)
-assert os.waitpid(number, 0)[1] == 0
-""".replace("SECONDS", str(SECONDS))
-
 
 def run(script: str) -> str:
     environment = os.environ | python_path(ROOT)
@@ -112,8 +88,3 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork") or not hasattr(signal, "
 def test_a_forked_process_renders_as_its_parent():
     lines = run(PARENT + FORK + MULTIPROCESSING + AFTER).splitlines()
     assert lines[-3:] == ["child True", "child True", "parent"]
-
-
-@pytest.mark.cuda
-def test_a_rendering_on_cuda_after_a_fork_says_so():
-    assert "Cannot re-initialize CUDA in forked subprocess" in run(CUDA)

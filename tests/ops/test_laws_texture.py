@@ -33,27 +33,20 @@ def test_a_residual_texture_is_what_it_adds(device: torch.device) -> None:
         draw(scene, make_texture(device=device, residual=True), clamp_texture=True)
 
 
-class Lookups:
-    """A texture's lookups: what `render` asks of it, and the answers."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        colors = nw.NeuralTexture.colors
-        self.positions: list[torch.Tensor] = []
-
-        def spy(texture: nw.NeuralTexture, positions: torch.Tensor, *arguments: Any, **options: Any) -> torch.Tensor:
-            self.positions.append(positions.detach())
-            return colors(texture, positions, *arguments, **options)
-
-        monkeypatch.setattr(nw.NeuralTexture, "colors", spy)
-
-
 @pytest.mark.parametrize("jitter", [0.5, 3.0])
 def test_jitter_moves_lookups_along_their_rays(
     jitter: float, device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By a normal share of a pixel's size there, and nothing but what the texture says changes."""
     scene = random_scene(width=120, height=90, device=device)
-    texture, lookups = make_texture(device=device), Lookups(monkeypatch)
+    texture, colors = make_texture(device=device), nw.NeuralTexture.colors
+    lookups: list[torch.Tensor] = []
+
+    def spy(texture: nw.NeuralTexture, positions: torch.Tensor, *arguments: Any, **options: Any) -> torch.Tensor:
+        lookups.append(positions.detach())
+        return colors(texture, positions, *arguments, **options)
+
+    monkeypatch.setattr(nw.NeuralTexture, "colors", spy)
     still, camera = draw(scene, texture), make_camera(scene)
     generator = torch.Generator(device).manual_seed(3)
     factors = jitter_factors(camera, 2, jitter, scene["means"].dtype, generator)
@@ -61,7 +54,7 @@ def test_jitter_moves_lookups_along_their_rays(
     assert_same(moved, still, ("plain", "depths", "weights", "alpha"))
     assert torch.equal(moved.ids, still.ids)
     hit = still.ids >= 0
-    before, after = (x[hit] - camera.position.detach() for x in lookups.positions)
+    before, after = (x[hit] - camera.position.detach() for x in lookups[:2])
     share = after.norm(dim=-1) / before.norm(dim=-1)
     assert_close(after, before * share[:, None], kind="value", name="along the ray")
     pixels = (share - 1) * camera.focal

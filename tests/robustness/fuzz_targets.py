@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
@@ -68,14 +69,15 @@ def _files(folder: Path) -> Files:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def _photos(folder: Path, mode: str = "RGB") -> list[str]:
-    from PIL import Image
+def _noise(*channels: int, most: int = 256, dtype: type = np.uint8) -> Image.Image:
+    return Image.fromarray(np.random.default_rng(0).integers(0, most, (HEIGHT, WIDTH, *channels), dtype=dtype))
 
+
+def _photos(folder: Path, mode: str = "RGB") -> list[str]:
     folder.mkdir(parents=True, exist_ok=True)
-    rng = np.random.default_rng(0)
     names = [f"{index}.png" for index in range(VIEWS)]
     for name in names:
-        Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, len(mode)), dtype=np.uint8)).save(folder / name)
+        _noise(len(mode)).save(folder / name)
     return names
 
 
@@ -270,12 +272,8 @@ def _camera_path(folder: Path) -> list[Files]:
 
 
 def _images(folder: Path) -> list[Files]:
-    from PIL import Image
-
     folder.mkdir(parents=True, exist_ok=True)
-    rng = np.random.default_rng(0)
-    color = Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 4), dtype=np.uint8))
-    wide = Image.fromarray(rng.integers(0, 2**16, (HEIGHT, WIDTH), dtype=np.uint16))
+    color, wide = _noise(4), _noise(most=2**16, dtype=np.uint16)
     rgb, grey, palette = (color.convert(mode) for mode in ("RGB", "L", "P"))
     pictures = {
         "rgb.jpg": rgb, "grey.jpg": grey, "cmyk.jpg": color.convert("CMYK"), "rgba.png": color, "grey.png": grey,
@@ -303,17 +301,13 @@ def _read_images(folder: Path) -> None:
 
 
 def _photo_files(folder: Path) -> list[Files]:
-    from PIL import Image
-
     folder.mkdir(parents=True, exist_ok=True)
-    rng = np.random.default_rng(0)
     exif = Image.Exif()
     exif[MAKE], exif[MODEL] = "maker", "model"
     exif[274] = 6  # orientation
     exif.get_ifd(34665)[41989] = 35  # focal length of a 35 mm film
     for name in ("a.jpg", "b.jpg"):
-        image = Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8))
-        image.save(folder / name, exif=exif if name == "a.jpg" else Image.Exif())
+        _noise(3).save(folder / name, exif=exif if name == "a.jpg" else Image.Exif())
     return [{"a.jpg": data} for data in _files(folder).values()]
 
 
