@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from nexwarp import ops
-from tests.narrowing import present
 from tests.reference import sh as reference
 from tests.tolerances import assert_close
 
@@ -94,15 +93,3 @@ def test_clamped_channels_have_no_gradient(device: torch.device) -> None:
 
 def test_gradcheck(device: torch.device) -> None:
     assert torch.autograd.gradcheck(lambda *x: colors_of(list(x), 3), make(6, 3, torch.float64, device))
-
-
-@pytest.mark.parametrize("wanted", NAMES)
-def test_one_gradient_alone(wanted: str, device: torch.device) -> None:
-    leaves = make(40, 2, torch.float64, device)
-    expected = dict(zip(NAMES, gradients(leaves, 2), strict=True))
-    for name, x in zip(NAMES, leaves, strict=True):
-        x.requires_grad_(name == wanted)
-    colors = colors_of(leaves, 2)
-    colors.backward(signal(colors))
-    for name, x in zip(NAMES, leaves, strict=True):
-        assert torch.equal(present(x.grad), expected[name]) if name == wanted else x.grad is None, name

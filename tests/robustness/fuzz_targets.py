@@ -28,7 +28,6 @@ from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
-from nexwarp.run.log import keep_lines
 from nexwarp.train.recipe import Config
 from tests.robustness.fuzz_inputs import Files
 from tests.robustness.fuzz_models import (
@@ -220,24 +219,6 @@ def _metrics(folder: Path) -> list[Files]:
     return [_files(folder)]
 
 
-def _log(folder: Path) -> list[Files]:
-    folder.mkdir(parents=True, exist_ok=True)
-    lines = [json.dumps({"iteration": i, "loss": 0.1, "losses": {"rgb": 0.1}, "psnr": None}) for i in (1, 3, 5)]
-    (folder / "metrics.jsonl").write_text("".join(f"{line}\n" for line in lines))
-    return [_files(folder)]
-
-
-def _read_log(folder: Path) -> None:
-    """Drop what a resumed training drops: damaged lines, and those of later iterations."""
-    file = folder / "metrics.jsonl"
-    before = file.read_bytes() if file.exists() else b""
-    keep_lines(file, 3)
-    after = file.read_bytes() if file.exists() else b""
-    assert all(json.loads(line)["iteration"] <= 3 for line in after.splitlines())
-    if len(after.splitlines()) < 2:
-        raise ValueError(f"{file}: expected two lines up to iteration 3, got {len(before)} bytes of others")
-
-
 def _read_cameras(folder: Path) -> None:
     for members in load_cameras(folder / "cameras.json").values():
         for camera in members.values():
@@ -331,7 +312,6 @@ TARGETS = {
         FuzzTarget("cameras", _run_cameras, _read_cameras, (".json",)),
         FuzzTarget("checkpoint", _checkpoint, _read_checkpoint, (".json", ".safetensors")),
         FuzzTarget("metrics", _metrics, read_metrics, (".json",)),
-        FuzzTarget("log", _log, _read_log, (".jsonl",)),
         FuzzTarget("camera_path", _camera_path, _read_camera_path, (".json",)),
         FuzzTarget("ply", _ply, lambda folder: read_ply(folder / "points.ply"), (".ply",)),
         FuzzTarget("masks", _images, _read_images, ("mask",)),
