@@ -24,7 +24,7 @@ from benchmarks.gpu_time import gpu_time
 from benchmarks.scenes import Geometry, SurfelScene, entries, fox, garden, geometry, outputs, random_like
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure, ratio
-from nexwarp.kernels.types import TILE_SIZE
+from nexwarp.native.warp import TILE_SIZE
 
 NEARS = (0.01, 0.05, 0.2)
 HEADLINE = 0.2

@@ -18,9 +18,10 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.surfel import hit, hit_alpha
+from nexwarp.kernels.shape import alpha_at, far_outside
+from nexwarp.kernels.surfel import hit
 from nexwarp.kernels.types import TileLists, types
-from nexwarp.kernels.walk import PIXELS, block_of, overflowed, pixel_of, stage, walk
+from nexwarp.kernels.walk import block_of, overflowed, pixel_of, stage, tile_of, walk
 from nexwarp.native.staging import BLOCK_DIM, staged_name, staged_record
 from nexwarp.native.vector_loads import load_record, record_row
 from nexwarp.native.warp import any_in_warp, lane_index, warp_size
@@ -70,7 +71,7 @@ def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
         color = vec3()
         ids, weights = buffer.empty()
         overflow = overflowed(lists)
-        bounds = walk(thread // PIXELS, lists, overflow)
+        bounds = walk(tile_of(thread), lists, overflow)
         stop = int(bounds[0])
         width = warp_size()
         lane = lane_index()
@@ -84,7 +85,9 @@ def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
                 a, b, n, c = staged_record(slot, surfels.records, i)
                 u, v, depth = hit(a, b, n, c[3], d)
                 # On a GPU some lane nearly always needs the exponentials.
-                alpha = hit_alpha(a, b, n, u, v, surfels.limits[i], width > 1)
+                alpha = real(0.0)
+                if width > 1 or not far_outside(u, v, surfels.limits[i]):
+                    alpha = alpha_at(u, v, a[3], b[3], n[3])
                 if alpha >= ALPHA_MIN and depth > view.near and transmittance >= TRANSMITTANCE_MIN:
                     weight = alpha * transmittance
                     transmittance = transmittance * (ONE - alpha)

@@ -29,9 +29,10 @@ from types import SimpleNamespace
 import warp as wp
 
 from nexwarp.kernels.collect import hit_buffer
-from nexwarp.kernels.surfel import hit, hit_alpha, hit_gradients, record_gradients
+from nexwarp.kernels.shape import alpha_at, far_outside
+from nexwarp.kernels.surfel import hit, hit_gradients, record_gradients
 from nexwarp.kernels.types import TileLists, types
-from nexwarp.kernels.walk import PIXELS, block_of, overflowed, pixel_of, stage, walk
+from nexwarp.kernels.walk import block_of, overflowed, pixel_of, stage, tile_of, walk
 from nexwarp.native.fixed_point import fixed_point_add, fixed_point_record_sum
 from nexwarp.native.staging import BLOCK_DIM, staged_name, staged_record
 from nexwarp.native.warp import any_in_warp, lane_index, warp_max, warp_record_sum, warp_size, warp_sum
@@ -220,7 +221,7 @@ def collect_backward_kernel(
             error = grads.errors[p]
         transmittance = real(1.0)
         overflow = overflowed(lists)
-        bounds = walk(thread // PIXELS, lists, overflow)
+        bounds = walk(tile_of(thread), lists, overflow)
         width = warp_size()
         lane = lane_index()
         last = wp.min(warp_max(stop), bounds[1])
@@ -232,8 +233,11 @@ def collect_backward_kernel(
                 k = name[1]
                 a, b, n, c = staged_record(slot, surfels.records, i)
                 u, v, depth = hit(a, b, n, c[3], d)
-                # Straight on, so that the compiler can use the exponentials again for the derivative.
-                alpha = hit_alpha(a, b, n, u, v, surfels.limits[i], width > 1)
+                # A CPU skips at once what certainly does not count. Behind that, alpha is computed straight on, so that
+                # the compiler uses its exponentials again for the derivative.
+                if width == 1 and (k >= stop or far_outside(u, v, surfels.limits[i])):
+                    continue
+                alpha = alpha_at(u, v, a[3], b[3], n[3])
                 if not (k < stop and alpha >= ALPHA_MIN and depth > view.near):
                     alpha = ZERO
                 if any_in_warp(wp.where(alpha > ZERO, 1, 0)) != 0:

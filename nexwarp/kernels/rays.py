@@ -20,9 +20,10 @@ import warp as wp
 from nexwarp.kernels.collect import hit_buffer
 from nexwarp.kernels.shape import reach
 from nexwarp.kernels.surfel import hit_alpha
-from nexwarp.kernels.types import TILE_SIZE, Mat33, Vec2, Vec3, Vec4, types
-from nexwarp.kernels.walk import PIXELS
+from nexwarp.kernels.types import Mat33, Vec2, Vec3, Vec4, types
+from nexwarp.kernels.walk import tile_of
 from nexwarp.native.vector_loads import load_record, record_row
+from nexwarp.native.warp import tile_size
 
 # Relative to the lengths of the vectors: what rounding may change in the sums that decide whether a tile is culled.
 SLACK = wp.constant(wp.float64(1e-5))
@@ -235,10 +236,11 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
         surface: t.Surface,
     ):
         thread = first + wp.tid()
-        tile = thread // PIXELS
-        local = thread % PIXELS
-        x = (tile % view.tile_columns) * TILE_SIZE + local % TILE_SIZE
-        y = (tile // view.tile_columns) * TILE_SIZE + local // TILE_SIZE
+        side = tile_size()
+        tile = tile_of(thread)
+        local = thread % (side * side)
+        x = (tile % view.tile_columns) * side + local % side
+        y = (tile // view.tile_columns) * side + local // side
         if x >= view.size[0] or y >= view.size[1]:
             return
         p = y * view.size[0] + x
@@ -261,7 +263,7 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
             k += wp.int64(1)
             a, b, n, c = load_record(surfels.records, i)
             u, v, depth = r.hit(surfels, i, a, b, n, c[3], ray)
-            alpha = hit_alpha(a, b, n, u, v, surfels.limits[i], False)
+            alpha = hit_alpha(a, b, n, u, v, surfels.limits[i])
             if alpha >= ALPHA_MIN and depth > view.near:
                 weight = alpha * transmittance
                 if transmittance > HALF:

@@ -19,7 +19,7 @@ import warp as wp
 
 from nexwarp.kernels.surfel import facing_side, hit, hit_alpha
 from nexwarp.kernels.types import TileLists, types
-from nexwarp.kernels.walk import PIXELS, block_of, candidate, overflowed, pixel_of, walk
+from nexwarp.kernels.walk import block_of, candidate, overflowed, pixel_of, tile_of, walk
 from nexwarp.native.vector_loads import load_record
 from nexwarp.native.warp import ballot, from_lane, lane_index, lowest_lane, warp_max, warp_size
 
@@ -60,7 +60,7 @@ def surface_kernel(real: type) -> wp.Kernel:
         normals = vec3()
         pick = wp.vec2i(-1, -1)
         overflow = overflowed(lists)
-        bounds = walk(thread // PIXELS, lists, overflow)
+        bounds = walk(tile_of(thread), lists, overflow)
         width = warp_size()
         lane = lane_index()
         last = wp.min(warp_max(stop), bounds[1])
@@ -74,7 +74,7 @@ def surface_kernel(real: type) -> wp.Kernel:
                 if batch + source < stop:
                     a, b, n, c = load_record(surfels.records, i)
                     u, v, depth = hit(a, b, n, c[3], d)
-                    alpha = hit_alpha(a, b, n, u, v, surfels.limits[i], False)
+                    alpha = hit_alpha(a, b, n, u, v, surfels.limits[i])
                     if alpha >= ALPHA_MIN and depth > view.near:
                         weight = alpha * transmittance
                         if transmittance > HALF:

@@ -20,7 +20,7 @@ import warp as wp
 from nexwarp.kernels.collect_backward import add_function, gradient_types
 from nexwarp.kernels.surfel import facing_side, hit, hit_alpha, hit_gradients, record_gradients
 from nexwarp.kernels.types import TileLists, types
-from nexwarp.kernels.walk import PIXELS, block_of, candidate, overflowed, pixel_of, walk
+from nexwarp.kernels.walk import block_of, candidate, overflowed, pixel_of, tile_of, walk
 from nexwarp.native.vector_loads import load_record
 from nexwarp.native.warp import (
     any_in_warp,
@@ -75,7 +75,7 @@ def surface_backward_kernel(real: type, fixed_point: bool = False, by_place: boo
             grad_mean = grads.expected[p] / surface.totals[p]
         transmittance = real(1.0)
         overflow = overflowed(lists)
-        bounds = walk(thread // PIXELS, lists, overflow)
+        bounds = walk(tile_of(thread), lists, overflow)
         width = warp_size()
         lane = lane_index()
         last = wp.min(warp_max(stop), bounds[1])
@@ -89,7 +89,7 @@ def surface_backward_kernel(real: type, fixed_point: bool = False, by_place: boo
                 k = batch + source
                 a, b, n, c = load_record(surfels.records, i)
                 u, v, depth = hit(a, b, n, c[3], d)
-                alpha = hit_alpha(a, b, n, u, v, surfels.limits[i], False)
+                alpha = hit_alpha(a, b, n, u, v, surfels.limits[i])
                 if not (k < stop and alpha >= ALPHA_MIN and depth > view.near):
                     alpha = ZERO
                 if any_in_warp(wp.where(alpha > ZERO, 1, 0)) != 0:

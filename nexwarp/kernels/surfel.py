@@ -85,10 +85,10 @@ def hit(a: Vec4, b: Vec4, n: Vec4, m: Real, d: Vec2):
 
 
 @wp.func
-def hit_alpha(a: Vec4, b: Vec4, n: Vec4, u: Real, v: Real, limit: Real, straight: wp.bool):
-    """Opacity at (u, v); `straight` on, or sparing the exponentials where they are certainly not needed."""
+def hit_alpha(a: Vec4, b: Vec4, n: Vec4, u: Real, v: Real, limit: Real):
+    """Opacity at (u, v), sparing the exponentials where they are certainly not needed."""
     alpha = type(u)(0.0)
-    if straight or not far_outside(u, v, limit):
+    if not far_outside(u, v, limit):
         alpha = alpha_at(u, v, a[3], b[3], n[3])
     return alpha
 

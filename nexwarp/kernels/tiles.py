@@ -15,8 +15,9 @@ import warp as wp
 
 from nexwarp.kernels.shape import reach
 from nexwarp.kernels.surfel import axes, intrinsics_of, rotate, translation
-from nexwarp.kernels.types import TILE_SIZE, Real, Vec3, Vec4, types
+from nexwarp.kernels.types import Real, Vec3, Vec4, types
 from nexwarp.native.vector_loads import load_pair
+from nexwarp.native.warp import tile_size
 
 # Pixels added around the polygon: rounding must never cull a hit.
 MARGIN = 0.01
@@ -120,7 +121,6 @@ def tile_polygon_kernel(real: type) -> wp.Kernel:
     mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
     ZERO, HALF, ONE = t.ZERO, t.HALF, t.ONE
     HUGE = wp.constant(real(LARGEST))
-    SIZE = wp.constant(real(TILE_SIZE))
     clip = clip_function(real)
     RELATIVE = wp.constant(real(RELATIVE_MARGIN))
 
@@ -141,6 +141,7 @@ def tile_polygon_kernel(real: type) -> wp.Kernel:
         polygons: t.Polygons,
     ):
         i = first + wp.tid()
+        side = real(float(tile_size()))
         # Nothing to see: no corners, and no rows.
         polygons.shapes[i] = wp.vec3i(0, 0, -1)
         polygons.margins[i] = ZERO
@@ -178,8 +179,8 @@ def tile_polygon_kernel(real: type) -> wp.Kernel:
         blur = RELATIVE * diameter * wp.max(intrinsics[0], intrinsics[1]) / nearest
         margin = real(MARGIN) + RELATIVE * size + blur
         # A tile's samples are its pixel centres, half a pixel inside its border.
-        y0 = tile_index((low[1] - margin + HALF) / SIZE - ONE, tile_rows)
-        y1 = tile_index((high[1] + margin - HALF) / SIZE, tile_rows)
+        y0 = tile_index((low[1] - margin + HALF) / side - ONE, tile_rows)
+        y1 = tile_index((high[1] + margin - HALF) / side, tile_rows)
         polygons.margins[i] = margin
         polygons.shapes[i] = wp.vec3i(count, wp.max(y0, 0), wp.min(y1, tile_rows - 1))
 
@@ -192,14 +193,14 @@ def span_function(real: type) -> wp.Function:
     t = types(real)
     HALF, ONE = t.HALF, t.ONE
     HUGE = wp.constant(real(LARGEST))
-    SIZE = wp.constant(real(TILE_SIZE))
 
     @wp.func
     def span(i: int, row: int, tile_columns: int, count: int, polygons: t.Polygons):
         """First and last tile of a tile row that the tile polygon touches; first > last when none."""
+        side = real(float(tile_size()))
         margin = polygons.margins[i]
-        top = real(float(row)) * SIZE + HALF - margin
-        bottom = real(float(row + 1)) * SIZE - HALF + margin
+        top = real(float(row)) * side + HALF - margin
+        bottom = real(float(row + 1)) * side - HALF + margin
         low = real(HUGE)
         high = real(-HUGE)
         if count > 0:
@@ -220,11 +221,11 @@ def span_function(real: type) -> wp.Function:
                 p = q
         if not (low <= high):
             return wp.vec2i(0, -1)
-        left = (low - margin + HALF) / SIZE - ONE
+        left = (low - margin + HALF) / side - ONE
         x0 = tile_index(left, tile_columns)
         if left > real(float(x0)):
             x0 += 1
-        x1 = tile_index((high + margin - HALF) / SIZE, tile_columns)
+        x1 = tile_index((high + margin - HALF) / side, tile_columns)
         return wp.vec2i(wp.max(x0, 0), wp.min(x1, tile_columns - 1))
 
     return span

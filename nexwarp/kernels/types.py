@@ -14,8 +14,6 @@ Real = Vec2 = Vec3 = Vec4 = Vec7 = Mat33 = Mat44 = Any
 # Of these structs there is one for each scalar type, see `types`.
 Surfels = View = Any
 
-TILE_SIZE = 16  # pixels along a tile's side
-
 ALPHA_MIN = 1.0 / 255.0
 ALPHA_MAX = 0.99
 TRANSMITTANCE_MIN = 1e-4

@@ -3,7 +3,8 @@
 A thread is a pixel. The 32 threads of a warp are a block of 8 x 4 pixels, the warps of a tile cover its pixels, and the
 tiles cover the image, so that some threads lie outside of it. A warp culls the list together: each lane tests one entry
 against the whole block, then all lanes walk along the entries that are left, about half of a tile's, whose records wait
-in shared memory. On a CPU a warp is one thread, which tests nothing here, since the hit itself is as cheap.
+in shared memory. On a CPU a warp is one thread, which tests nothing here, since the hit itself is as cheap: tiles are
+smaller instead.
 
 Read: the lists of `nexwarp.ops.Tiles`, and the records of `surfel`. Nothing here is written or differentiated; which
 entries are walked is frozen for the backward pass.
@@ -12,13 +13,11 @@ entries are walked is frozen for the backward pass.
 import warp as wp
 
 from nexwarp.kernels.surfel import intrinsics_of, ray_through
-from nexwarp.kernels.types import TILE_SIZE, Real, Surfels, TileLists, Vec2, Vec4, View
+from nexwarp.kernels.types import Real, Surfels, TileLists, Vec2, Vec4, View
 from nexwarp.native.staging import stage_record
 from nexwarp.native.vector_loads import record_row
-from nexwarp.native.warp import ballot, lanes_below, population, sync_warp, warp_size
+from nexwarp.native.warp import ballot, lanes_below, population, sync_warp, tile_size, warp_size
 
-PIXELS = TILE_SIZE * TILE_SIZE
-BLOCKS_ACROSS = TILE_SIZE // 8
 # Half of the distances between the outer pixel centres of a block, and a little.
 HALF_WIDTH = wp.constant(wp.float64(3.51))
 HALF_HEIGHT = wp.constant(wp.float64(1.51))
@@ -57,15 +56,23 @@ def surfel_at(k: wp.int32, lists: TileLists, overflow: wp.bool):
 
 
 @wp.func
+def tile_of(thread: int):
+    """Tile that a thread's pixel is in."""
+    return thread // (tile_size() * tile_size())
+
+
+@wp.func
 def pixel_of(thread: int, view: View):
     """(pixel's column and row, whether it is in the image, its ray)."""
-    tile = thread // PIXELS
-    local = thread % PIXELS
+    side = tile_size()
+    tile = tile_of(thread)
+    local = thread % (side * side)
     block = local // 32
     lane = local % 32
+    blocks_across = side // 8
     xy = wp.vec2i(
-        (tile % view.tile_columns) * TILE_SIZE + (block % BLOCKS_ACROSS) * 8 + lane % 8,
-        (tile // view.tile_columns) * TILE_SIZE + (block // BLOCKS_ACROSS) * 4 + lane // 8,
+        (tile % view.tile_columns) * side + (block % blocks_across) * 8 + lane % 8,
+        (tile // view.tile_columns) * side + (block // blocks_across) * 4 + lane // 8,
     )
     half = type(view.near)(0.5)
     x = type(view.near)(float(xy[0])) + half

@@ -9,6 +9,20 @@ import warp as wp
 
 from nexwarp.native import for_both_reals, snippet
 
+# Pixels along a tile's side. A GPU's warps cull within their tile; on a CPU tiles alone do, so they are smaller there.
+TILE_SIZE, CPU_TILE_SIZE = 16, 8
+
+
+def tile_size_on(on_gpu: bool) -> int:
+    """Pixels along a tile's side."""
+    return TILE_SIZE if on_gpu else CPU_TILE_SIZE
+
+
+@wp.func_native(snippet(f"return {TILE_SIZE};", f"return {CPU_TILE_SIZE};"))
+def tile_size() -> wp.int32:
+    """Return the number of pixels along a tile's side."""
+    ...
+
 
 @wp.func_native(snippet("return __any_sync(0xffffffffu, x);", "return x;"))
 def any_in_warp(x: wp.int32) -> wp.int32:

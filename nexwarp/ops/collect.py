@@ -11,8 +11,9 @@ from nexwarp.errors import check_tensors
 from nexwarp.kernels.collect import collect_kernel
 from nexwarp.kernels.collect_backward import collect_backward_kernel, gradient_types, reduce_slots_kernel
 from nexwarp.kernels.launch import Sharing
-from nexwarp.kernels.types import MAX_HITS, TILE_SIZE, TileLists, types
+from nexwarp.kernels.types import MAX_HITS, TileLists, types
 from nexwarp.native.staging import BLOCK_DIM
+from nexwarp.native.warp import tile_size_on
 from nexwarp.ops._interop import (
     Argument,
     Context,
@@ -146,7 +147,7 @@ def view_of(camera: Pinhole, real: type, columns: int) -> Argument:
 
 def launch_pixels(like: torch.Tensor, kernel: wp.Kernel, tiles: int, arguments: list[Argument]) -> None:
     """Launch a kernel over the pixels of a number of tiles."""
-    pixels = TILE_SIZE**2
+    pixels = tile_size_on(like.is_cuda) ** 2
     # All pixels of a tile write to its entries, so one CPU thread must walk them all.
     sharing = Sharing(smallest=pixels, align=pixels, even=False)
     launch(like, kernel, tiles * pixels, arguments, [], block_dim=BLOCK_DIM, sharing=sharing)

@@ -8,7 +8,8 @@ import warp as wp
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.rays import UNBOUNDED, collect_rays_kernel, ray_list_kernel
 from nexwarp.kernels.tiles import check_entries
-from nexwarp.kernels.types import TILE_SIZE, types
+from nexwarp.kernels.types import types
+from nexwarp.native.warp import tile_size_on
 from nexwarp.ops._interop import array, launch, real_of, struct
 from nexwarp.ops.collect import hits_argument, launch_pixels
 from nexwarp.ops.memory import check_memory
@@ -108,7 +109,8 @@ def intersect_rays(surfels: RayRecords, keys: torch.Tensor, rays: torch.Tensor) 
         ValueError, OutOfMemoryError: there are more entries than lists or memory hold.
     """
     height, width = rays.shape[:2]
-    columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
+    side = tile_size_on(rays.is_cuda)
+    columns, rows = -(-width // side), -(-height // side)
     real = real_of(rays)
     t = types(real)
     order = torch.sort(keys.float(), stable=True).indices.int()
@@ -117,7 +119,7 @@ def intersect_rays(surfels: RayRecords, keys: torch.Tensor, rays: torch.Tensor) 
     kernels = ray_list_kernel(real)
     bounds = (
         dict(zip(kernels.Bounds.vars, map(array, _bounds(rays, side), (t.mat33, t.vec2, t.vec2)), strict=True))
-        for side in (TILE_SIZE, TILE_SIZE * SPAN)
+        for side in (side, side * SPAN)
     )
     inputs = [
         array(order, wp.int32),

@@ -17,7 +17,8 @@ from nexwarp.kernels.tile_lists import (
     tile_offsets_kernel,
 )
 from nexwarp.kernels.tiles import MAX_CORNERS, MAX_ENTRIES, check_entries, tile_polygon_kernel
-from nexwarp.kernels.types import TILE_SIZE, types
+from nexwarp.kernels.types import types
+from nexwarp.native.warp import tile_size_on
 from nexwarp.ops._interop import Argument, array, launch, real_of, stream_of, struct, warp_array, warp_streams
 from nexwarp.ops.memory import check_memory
 from nexwarp.ops.project import Pinhole, Projection
@@ -114,7 +115,8 @@ def intersect_tiles(
     tensors = [x.detach().contiguous() for x in surfels]
     means = tensors[0]
     real, count = real_of(means), len(means)
-    columns, rows = -(-camera.width // TILE_SIZE), -(-camera.height // TILE_SIZE)
+    side = tile_size_on(means.is_cuda)
+    columns, rows = -(-camera.width // side), -(-camera.height // side)
     order = _depth_order(projection.centers.detach(), blending)
     kind = (columns, rows)
     polygons, reaches = _tile_polygons(tensors, viewmat, camera, rows)
