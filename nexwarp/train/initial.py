@@ -1,6 +1,8 @@
 """Makes the initial surfels, on points of the cloud, and chooses the shape of the texture."""
 
+import dataclasses
 import math
+from typing import cast
 
 import numpy as np
 import torch
@@ -114,18 +116,11 @@ def texture_shape(scene: Scene, config: Config) -> TextureShape:
     finest = _pixel_resolution(scene) if asked.max_resolution is None else asked.max_resolution
     coarsest = min(64.0 / scene.scale, finest / 4) if asked.min_resolution is None else asked.min_resolution
     entries = _table_size(scene, asked.levels * asked.features) if asked.table_size is None else asked.table_size
-    return {
-        "levels": asked.levels,
-        "table_size": entries,
-        "features": asked.features,
-        "min_resolution": coarsest,
-        "max_resolution": finest,
-        "width": asked.width,
-        "hidden_layers": asked.hidden_layers,
-        "sh_degree": config.texture_sh_degree,
-        "residual": asked.residual,
-        "down_weighting": asked.down_weighting,
-    }
+    degree = config.sh_degree if asked.sh_degree is None else asked.sh_degree
+    shape = dataclasses.replace(
+        asked, table_size=entries, min_resolution=coarsest, max_resolution=finest, sh_degree=degree
+    )
+    return cast(TextureShape, dataclasses.asdict(shape))
 
 
 def cells_unit(scene: Scene, config: Config) -> float:

@@ -249,20 +249,10 @@ class Config(Recipe):
         """Iteration of this run that stands for one of a run of 30,000."""
         return max(1, round(iteration * self.iterations / REFERENCE_ITERATIONS))
 
-    @property
-    def texture_sh_degree(self) -> int:
-        """SH degree of the texture's colours."""
-        own = self.texture.sh_degree
-        return self.sh_degree if own is None else own
-
-    @property
-    def settled(self) -> int:
-        """First iteration of this run in which a pixel textures more than 2 hits, where K is more."""
-        return math.ceil(self.more_hits_from * self.iterations / REFERENCE_ITERATIONS)
-
     def hits_at(self, iteration: int) -> int:
         """K at an iteration of this run: `max_hits`, but at most 2 while surfels settle."""
-        return self.max_hits if iteration >= self.settled else min(self.max_hits, 2)
+        settled = math.ceil(self.more_hits_from * self.iterations / REFERENCE_ITERATIONS)
+        return self.max_hits if iteration >= settled else min(self.max_hits, 2)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as plain JSON values."""

@@ -255,11 +255,7 @@ class Trainer(TrainingState):
         )
 
     def finish(self, observe: FinishObserver = lambda *_: None) -> Model:
-        """Return a finished model of new surfels and the trainer's texture: smooth SH, detail limits, exposures.
-
-        Args:
-            observe: called with each stage's name, how many views of it are rendered, and of how many.
-        """
+        """Return a finished model of new surfels and the trainer's texture: smooth SH, detail limits, exposures."""
         if self.graphs is not None:
             self.graphs.clear()  # frees their memory; later steps are captured anew
         self.texture.drop_half_copy()
@@ -282,12 +278,7 @@ class Trainer(TrainingState):
         save_cameras(Path(folder, CAMERAS_FILE), self.scene.cameras)
 
     def save_checkpoint(self, run: Path) -> None:
-        """Write a checkpoint into a folder: everything that shapes the future of the run.
-
-        Raises:
-            DivergedError: something in it is not finite.
-            OSError: it cannot be written; those before it are as they were.
-        """
+        """Write a checkpoint into a folder; DivergedError where something is not finite, OSError on a failing disk."""
         self.check()
         if self.good is None or self.good.state["iteration"] != self.iteration:
             self.good = self.snapshot()
@@ -300,16 +291,13 @@ class Trainer(TrainingState):
         return load_checkpoint(run, warn)
 
     def restore(self, run: Path | str, warn: Callable[[str], None] = lambda _: None, *, extend: bool = False) -> None:
-        """Continue from the newest whole checkpoint of the same scene and settings.
+        """Continue from the newest whole checkpoint of the same scene and settings; `warn` is told of damaged ones.
 
-        Args:
-            run: run folder.
-            warn: is told of a damaged checkpoint that is passed over.
-            extend: also accept a checkpoint of a run of fewer iterations; schedules are those of `config.iterations`.
+        `extend` also accepts one of a run of fewer iterations; schedules are those of `config.iterations`.
 
         Raises:
-            FileNotFoundError: there is none.
-            ValueError: they are damaged, or scene, settings, optimizer or teachers differ.
+            MissingError: there is none.
+            CheckpointError: they are damaged, or scene, settings, optimizer or teachers differ.
         """
         snapshot = self._read(Path(run), warn)
         try:
@@ -326,7 +314,7 @@ class Trainer(TrainingState):
         return Snapshot(tensors, state | self.origin | {"config": self.config.as_dict()})
 
     def load_snapshot(self, snapshot: Snapshot) -> None:
-        """Return to a snapshot of this run, which stays as it is; ValueError or RuntimeError where it does not fit."""
+        """Return to a snapshot of this run, which stays as it is."""
         super().load_snapshot(snapshot)
         if self.graphs is not None:
             self.graphs.clear()

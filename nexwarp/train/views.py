@@ -38,11 +38,9 @@ class TrainingViews:
         self.device = device
         self.gains = None if gains is None else gains.to(device)
         self.lens = None if lens is None else copy.deepcopy(lens).to(device)
-        self.names = [view.name for view in views]
+        self.views = views
         self.cameras = [view.camera.to(device) for view in views]
         self.photos = [view.image for view in views]
-        self.masks = [view.mask for view in views]
-        self.alphas = [view.alpha for view in views]
         self.pool: ThreadPoolExecutor | None = None
         self.coming: dict[int, Future[tuple[torch.Tensor, torch.cuda.Event]]] = {}
         if device.type == "cuda":
@@ -70,9 +68,10 @@ class TrainingViews:
     def fingerprint(self) -> str:
         """Return a digest of the views' names and cameras."""
         digest = hashlib.sha256()
-        for name, camera in zip(self.names, self.cameras, strict=True):
+        for view in self.views:
+            camera = view.camera
             values = [*camera.viewmat.flatten().tolist(), *camera.K.flatten().tolist(), camera.width, camera.height]
-            digest.update(f"{name} {values}\n".encode())
+            digest.update(f"{view.name} {values}\n".encode())
         return digest.hexdigest()
 
     def get(self, index: int, ahead: Sequence[int] = ()) -> tuple[Camera, torch.Tensor]:
@@ -90,12 +89,12 @@ class TrainingViews:
 
     def mask(self, index: int) -> torch.Tensor | None:
         """Return the mask (H, W) bool of a photo, or None."""
-        mask = self.masks[index]
+        mask = self.views[index].mask
         return None if mask is None else mask.to(self.device, non_blocking=True)
 
     def alpha(self, index: int) -> torch.Tensor | None:
         """Return alpha (H, W) float in [0, 1] of a photo; None if it is opaque."""
-        alpha = self.alphas[index]
+        alpha = self.views[index].alpha
         return None if alpha is None else alpha.to(self.device, non_blocking=True).float() / 255.0
 
     def _on_device(self, index: int) -> torch.Tensor:

@@ -60,11 +60,6 @@ def test_the_table_is_as_large_as_the_photos_can_fill(scene, pixels, power):
     assert texture_shape(sized, small())["table_size"] == TEXTURE.table_size
 
 
-def test_given_resolutions_are_kept(scene):
-    config = small(texture=dataclasses.replace(TEXTURE, min_resolution=3.0, max_resolution=50.0))
-    assert texture_shape(scene, config) == dataclasses.asdict(config.texture) | {"sh_degree": 3}
-
-
 def directions(count: int) -> torch.Tensor:
     return torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
 

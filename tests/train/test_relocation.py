@@ -18,7 +18,7 @@ from nexwarp.train.relocation import least_contributing
 from nexwarp.train.trainer import Trainer
 from tests.ranks_support import run_ranks
 from tests.scenes import make_surfels, random_scene
-from tests.trainer_support import OFTEN, assert_same_state, small, trained
+from tests.trainer_support import OFTEN, small
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -99,10 +99,3 @@ def test_others_take_their_place(scene: Scene, monkeypatch: pytest.MonkeyPatch) 
     assert [iteration for iteration, *_ in removed] == [30]
     assert all(before[1:] == (budget, len(scene.train), 0.2) for before in removed)
     assert counts[30] == counts[33] == budget, "as many are split as were removed"
-
-
-def test_a_budget_that_is_not_used_up_is_left_alone(scene: Scene) -> None:
-    plenty, none = (
-        trained(scene, small(iterations=30, densify=dataclasses.replace(OFTEN, relocate=x))) for x in (0.3, 0.0)
-    )
-    assert_same_state(plenty, none)

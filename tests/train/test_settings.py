@@ -1,49 +1,159 @@
-"""Settings by name, and what training makes of masks, backgrounds and the frame's edge."""
+"""Settings: presets have their numbers, --set takes and refuses, and what a run keeps and --resume makes of it."""
 
 import dataclasses
-import re
+import json
+from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
+from PIL import Image
 
 import nexwarp as nw
-from nexwarp.data import Scene, View
-from nexwarp.run.evaluate import Evaluation, evaluate
-from nexwarp.train.recipe import PRESETS, Config, TextureConfig, preset
-from nexwarp.train.settings import config_from_dict, with_settings
-from nexwarp.train.trainer import Trainer
-from nexwarp.train.views import mean_color
-from tests.tolerances import assert_close
+from nexwarp.cli import main as cli
+from nexwarp.cli.train import Train
+from nexwarp.data.scene import SceneSource
+from nexwarp.train.recipe import PRESETS, Config, DensifyConfig, LearningRates, LossWeights, TextureConfig, preset
+from nexwarp.train.settings import config_from_dict, parse_settings, setting, with_settings
+from tests.scene_writers import write_blender, write_demo
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
-TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
+SHAPE = ["--set", "texture.levels=4", "--set", "texture.table_size=256", "--set", "texture.width=16"]
+FLAGS = [*SHAPE, "--iterations", "2", "--max-surfels", "50", "--device", "cpu"]
 
 
-@pytest.fixture(scope="session")
-def scene(tiny_scene: Scene) -> Scene:
-    return tiny_scene
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory) -> Path:
+    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=24, height=18, views=9, points=100)
 
 
-def make_trainer(scene: Scene, **settings) -> Trainer:
-    values: dict[str, Any] = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE} | settings
-    return Trainer(scene, Config(**values), "cpu")
+@pytest.fixture(scope="module")
+def run(scene, tmp_path_factory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "run"
+    extra = ["--set", "mask_mode=background", "--set", "rates.means=[1e-4, 1e-6]", "--set", "skybox=90"]
+    assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, *extra]) == 0
+    return run
 
 
-# Settings by name
+def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *words: str) -> None:
+    """Fail unless the command exits with 2 and one line on stderr that holds all of `words`."""
+    capsys.readouterr()
+    assert cli.main(arguments) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1, err
+    assert all(word in err for word in words), err
 
 
-def test_settings_reach_into_parts() -> None:
-    config = with_settings(Config(), {"max_hits": 3, "texture.residual": False, "rates.mlp": [1e-3, 1e-3]})
-    expected = dataclasses.replace(
-        Config(),
-        max_hits=3,
-        texture=dataclasses.replace(Config().texture, residual=False),
-        rates=dataclasses.replace(Config().rates, mlp=(1e-3, 1e-3)),
+# In Python
+
+
+def test_every_setting_can_be_set_to_what_it_is():
+    """By its name, through JSON, for all presets: the same config, with the same types."""
+    for config in PRESETS.values():
+        data = json.loads(json.dumps(config.as_dict()))
+        assert config_from_dict(data) == config
+        parts = {name: value for name, value in data.items() if isinstance(value, dict)}
+        flat = {name: value for name, value in data.items() if name not in parts}
+        flat |= {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
+        texts = [f"{name}={json.dumps(value)}" for name, value in flat.items()]
+        again = with_settings(Config(), parse_settings(texts))
+        assert again == config and repr(again) == repr(config)
+        assert all(setting(again, name) == setting(config, name) for name in flat)
+    whole = with_settings(Config(), {"texture.max_resolution": 1024, "background": [0, 0, 1]})  # integers for numbers
+    assert type(whole.texture.max_resolution) is float and whole.background == (0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("max_resolution=1", "max_resolution: expected a setting, such as texture.max_resolution"),
+        ("texture.nope=1", "texture.nope: expected a setting, such as texture."),
+        ("texture=1", "texture: expected a setting"),
+        ("texture.__init__=1", "texture.__init__: expected a setting"),
+        ("texture.levels=16.0", "texture.levels: expected an integer, got 16.0"),
+        ("texture.residual=1", "texture.residual: expected true or false, got 1"),
+        ("texture.max_resolution=NaN", "texture.max_resolution: expected a number or null, got NaN"),
+        (f"iterations=1{'0' * 4000}", "iterations: expected an integer, got 1000"),
+        ("mask_mode=3", "mask_mode: expected text, got 3"),
+        ("mask_mode=both", "mask_mode: expected one of ignore, background, got 'both'"),
+        ("rates.means=[1e-3]", "rates.means: expected a list of 2 numbers, got [0.001]"),
+        ("rates.means=[0.1, 0]", "rates.means: expected rates > 0, or 0 throughout, got (0.1, 0.0)"),
+        ("background=[0, 0, 2]", "background: expected at least 0 and at most 1, got 2"),
+        ("background=[[0], 0, 0]", "background: expected a number, got [0]"),
+        ("densify.every=0", "densify.every: expected at least 1, got 0"),
+        ("losses.dssim=2", "losses.dssim: expected at least 0 and at most 1, got 2"),
+        ("skybox", "expected KEY=VALUE, got 'skybox'"),
+        ("max_surfels=15", "max_surfels: expected at least 16, got 15"),
+        ("iterations=0", "iterations: expected at least 1, got 0"),
+        ("max_hits=9", "max_hits: expected at least 0 and at most 8, got 9"),
+        ("texture.levels=0", "texture.levels: expected at least 1 and at most 64, got 0"),
+        ("texture.table_size=1000", "texture.table_size: expected a power of two, got 1000"),
+        ("texture.sh_degree=4", "texture.sh_degree: expected at least 0 and at most 3, got 4"),
+        ("coarse=0.4", "coarse: expected a setting, got one that was removed"),
+        ("=1", "expected KEY=VALUE, got '=1'"),
+    ],
+)
+def test_refused(text, message):
+    with pytest.raises(ValueError) as caught:
+        with_settings(Config(), parse_settings([text]))
+    assert str(caught.value).startswith(message) and len(str(caught.value)) < 200
+
+
+# Presets and older versions
+
+
+def test_paper_is_the_paper():
+    """The numbers of recipe.md 3.9, spelt out."""
+    p = preset("paper")
+    assert (p.preset, p.iterations, p.max_hits, p.sh_degree, p.sh_every) == ("paper", 30_000, 2, 3, 1000)
+    assert p.more_hits_from == 0
+    assert (p.max_surfels, p.background) == (400_000, (0.0, 0.0, 0.0))
+    assert (p.filter_points, p.orient_points) == (False, False)
+    assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
+    assert (p.mask_mode, p.footprints, p.smooth_sh) == ("ignore", False, 0.0)
+    assert not p.exposures
+    assert p.rates == LearningRates(
+        means=(1.6e-4, 1.6e-6),
+        quats=1e-3,
+        scales=5e-3,
+        opacities=0.025,
+        gammas=1e-3,
+        sh0=2.5e-3,
+        shN=1.25e-4,
+        grid=(1e-3, 1e-5),
+        mlp=(1e-3, 1e-3),
     )
-    assert config == expected
-    assert config_from_dict(config.as_dict()) == config
+    assert p.texture == TextureConfig(
+        levels=16,
+        table_size=2**20,
+        features=2,
+        min_resolution=16.0,
+        max_resolution=256.0,
+        width=64,
+        hidden_layers=2,
+        sh_degree=None,
+        residual=False,
+        down_weighting=True,
+    )
+    assert p.densify == DensifyConfig(
+        start=500,
+        stop=25_000,
+        every=100,
+        fraction=0.05,
+        prune_opacity=0.005,
+        prune_at_cap=False,
+        relocate=0.0,
+    )
+
+
+def test_default_prunes_at_the_cap_and_filters_points():
+    p = preset("default")
+    assert p == Config() and p.densify.prune_at_cap and p.filter_points
+    assert p.texture.min_resolution is None and p.texture.max_resolution is None
+    assert p.texture.residual and p.background is None and p.losses.depth > 0
+
+
+def test_unknown_preset_is_refused():
+    with pytest.raises(ValueError, match=r"^preset: expected one of default, paper, web, got 'papr'$"):
+        preset("papr")
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
@@ -58,147 +168,89 @@ def test_settings_of_an_older_version_are_completed_from_their_preset(name: str)
     assert config_from_dict({"preset": "of mine", "seed": 3}) == dataclasses.replace(Config(), preset="of mine", seed=3)
 
 
-@pytest.mark.parametrize("name", ["texture.residul", "texture.levels.x", "colour", "seed.x", "losses.", ".residual"])
-def test_unknown_settings_are_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"^{re.escape(name)}: expected a setting, such as "):
-        with_settings(Config(), {name: 3})
+def test_runs_from_before_a_setting_keep_what_they_did():
+    written = Config().as_dict()
+    assert config_from_dict(written) == Config()
+    del written["densify"]["relocate"]
+    assert config_from_dict(written).densify == dataclasses.replace(DensifyConfig(), relocate=0.0)
+    del written["skybox"]
+    assert config_from_dict(written).skybox == 0
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    "change",
     [
-        ({"mask_mode": "hide"}, "mask_mode: expected one of ignore, background, got 'hide'"),
-        ({"losses.depth": -1.0}, "losses.depth: expected at least 0, got -1.0"),
-        ({"texture.levels": 0}, "texture.levels: expected at least 1 and at most 64, got 0"),
-        ({"texture.table_size": 1000}, "texture.table_size: expected a power of two, got 1000"),
-        ({"texture.sh_degree": 4}, "texture.sh_degree: expected at least 0 and at most 3, got 4"),
+        lambda d: d | {"texture": 3},
+        lambda d: d | {"iterations": "many"},
+        lambda _: [],
     ],
 )
-def test_values_out_of_range_are_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
-        with_settings(Config(), settings)
+def test_settings_of_another_kind_are_refused(change):
+    with pytest.raises(ValueError, match=r"^config: expected the settings of a nexwarp run") as caught:
+        config_from_dict(change(Config().as_dict()))
+    assert "\n" not in str(caught.value)
 
 
-# The camera of a window
+# nexwarp train --set
 
 
-def test_a_window_sees_what_the_camera_sees_there(scene: Scene) -> None:
-    camera = scene.train[0].camera
-    window = camera.crop(5, -3, 20, 30)
-    assert (window.width, window.height, window.near) == (20, 30, camera.near)
-    pixels, depths = camera.project(scene.points)
-    shifted, same = window.project(scene.points)
-    assert_close(shifted, pixels - torch.tensor([5.0, -3.0]), kind="value", name="pixels")
-    assert torch.equal(depths, same)
-    again = nw.Camera(window.viewmat, window.K, 20, 30, camera.near)
-    assert (again.cx, again.cy, again.fx) == pytest.approx((window.cx, window.cy, window.fx))
-    assert camera.crop(0, 0, camera.width, camera.height).cx == camera.cx
+def test_a_run_keeps_what_was_set(run):
+    stored = json.loads((run / "config.json").read_text())["config"]
+    config = config_from_dict(stored)
+    changes: dict[str, Any] = {"texture.levels": 4, "texture.table_size": 256, "texture.width": 16, "skybox": 90}
+    changes |= {"mask_mode": "background", "rates.means": (1e-4, 1e-6), "iterations": 2, "max_surfels": 50}
+    assert config == with_settings(preset("default"), changes)
+    texture = nw.load(run).texture
+    assert texture is not None and texture.grid.shape == (4, 256, 4)
 
 
-# Backgrounds
+def test_resume_agrees_or_is_refused(run, scene, capsys):
+    resume = ["train", str(scene), "--run", str(run), "--resume", "--device", "cpu"]
+    assert cli.main([*resume, "--set", "texture.levels=4", "--set", "mask_mode=background"]) == 0
+    # What shapes no number may change.
+    assert cli.main([*resume, "--set", "cuda_graphs=false"]) == 0
+    before = (run / "config.json").read_bytes()
+    expected = "--set: texture.levels: expected 4 as in the run to resume, got 8"
+    refused(capsys, [*resume, "--set", "texture.levels=8"], expected)
+    refused(capsys, [*resume, "--set", "texture.nope=8"], "--set: texture.nope: expected a setting")
+    refused(capsys, [*resume, "--set", "preset=paper"], "--set: preset: expected --preset instead")
+    assert (run / "config.json").read_bytes() == before
 
 
-def test_background_is_the_given_one_the_scenes_or_the_mean(scene: Scene) -> None:
-    photos = torch.stack([view.image for view in scene.train]).double() / 255
-    assert mean_color(scene.train) == pytest.approx(photos.mean((0, 1, 2)).tolist(), abs=1e-9)
-    assert make_trainer(scene).render_options().background == mean_color(scene.train)
-    black = make_trainer(scene, background=(0.0, 0.0, 0.0))
-    assert black.render_options().background == (0.0, 0.0, 0.0)
-    white = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))
-    assert make_trainer(white).render_options().background == (1.0, 1.0, 1.0)
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--set", "nope=1"], ["--set: nope: expected a setting"]),
+        (["--set", "skybox"], ["--set: expected KEY=VALUE, got 'skybox'"]),
+        (["--set", "texture.levels=many"], ['--set: texture.levels: expected an integer, got "many"']),
+        (["--set", "preset=paper"], ["--set: preset: expected --preset instead"]),
+        (["--seed", "1", "--set", "seed=1"], ["--set: seed: expected --seed instead"]),
+        (["--set", "seed=1", "--set", "seed=2"], ["--set: seed: expected it once"]),
+    ],
+)
+def test_bad_flags_leave_nothing_behind(scene, tmp_path, capsys, flags, words):
+    run = tmp_path / "runs" / "new"
+    refused(capsys, ["train", str(scene), "--run", str(run), "--device", "cpu", *flags], *words)
+    assert not run.parent.exists()
 
 
-def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) -> None:
-    alpha = torch.full((36, 48), 255, dtype=torch.uint8)
-    alpha[:10] = 51
-    views = [dataclasses.replace(v, alpha=alpha) for v in scene.train]
-    random = dataclasses.replace(scene, train=views, background=(1.0, 1.0, 1.0), random_background=True)
-    trainer = make_trainer(random)
-    seen = [trainer.targets.from_view(0) for _ in range(3)]
-    colors = [torch.as_tensor(view.background) for view in seen]
-    assert len({tuple(color.tolist()) for color in colors}) == 3
-    photo = views[0].image.float() / 255
-    for view, color in zip(seen, colors, strict=True):
-        expected = photo[:10] + 0.8 * (color - 1.0)
-        assert_close(view.photo[:10], expected, kind="value", name="transparent")
-        assert_close(view.photo[10:], photo[10:], kind="value", name="opaque")
-    assert trainer.render_options().background == (1.0, 1.0, 1.0)
+def test_a_scene_on_a_background_takes_it_from_its_flag(scene, tmp_path, capsys):
+    """Photos that were put on white must not be compared with renderings on another colour."""
+    path = write_blender(scene, tmp_path / "blender")
+    for file in path.rglob("*.png"):
+        with Image.open(file) as photo:
+            photo.putalpha(200)
+            photo.save(file)
+    flags = ["train", str(path), "--run", str(tmp_path / "run"), *FLAGS]
+    refused(capsys, [*flags, "--set", "background=[0, 0, 0]"], "--set: background: expected --background instead")
+    assert not (tmp_path / "run").exists()
 
 
-# Masks
-
-SQUARE = slice(10, 26), slice(14, 34)
-
-
-def with_intruder(scene: Scene, masked: bool) -> Scene:
-    """A red square before every training photo, and masks that leave it out."""
-    mask = torch.ones(36, 48, dtype=torch.bool)
-    mask[SQUARE] = False
-
-    def spoilt(view: View) -> View:
-        image = view.image.clone()
-        image[SQUARE] = torch.tensor([255, 0, 0], dtype=torch.uint8)
-        return dataclasses.replace(view, image=image, mask=mask if masked else None)
-
-    return dataclasses.replace(scene, train=[spoilt(view) for view in scene.train])
-
-
-def redness(trainer: Trainer) -> float:
-    """How much redder than their photos the test views are, in the middle, 0 to 1."""
-    views = trainer.scene.test
-    with torch.no_grad():
-        images = [out.image for out in trainer.model().render([view.camera for view in views])]
-    pairs = [(image[SQUARE], view.image[SQUARE] / 255) for image, view in zip(images, views, strict=True)]
-    return sum(((a[..., 0] - a[..., 2]) - (b[..., 0] - b[..., 2])).mean().item() for a, b in pairs) / len(pairs)
-
-
-@pytest.mark.timeout(120)
-def test_what_masks_leave_out_does_not_appear(scene: Scene) -> None:
-    """An intruder that moves with the camera, before every photo; learnt without masks, left out with them."""
-    settings = {"iterations": 120, "max_surfels": 400}
-    results = []
-    for masked in (False, True):
-        trainer = make_trainer(with_intruder(scene, masked), **settings)
-        trainer.run()
-        results.append(redness(trainer))
-    without, with_masks = results
-    assert without > 0.08
-    assert abs(with_masks) < 0.2 * without
-
-
-def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
-    mask = torch.zeros(36, 48, dtype=torch.bool)
-    mask[:, :24] = True
-    views = [dataclasses.replace(view, mask=mask) for view in scene.train]
-    halves = dataclasses.replace(scene, train=views)
-    alphas = {}
-    for mode in ("ignore", "background"):
-        trainer = make_trainer(halves, iterations=60, mask_mode=mode)
-        trainer.run()
-        with torch.no_grad():
-            view = trainer.targets.from_view(0)
-            outs = trainer.model().render([v.camera for v in scene.train])
-        alphas[mode] = torch.stack([out.alpha[:, 30:] for out in outs]).mean().item()
-        if mode == "background":
-            assert (view.photo[:, 24:] == torch.tensor(trainer.background)).all()
-            assert view.counts is None and view.empty is not None and torch.equal(view.empty, ~mask)
-    assert alphas["background"] < 0.75 * alphas["ignore"]
-
-
-def test_masks_take_part_in_the_judgement(scene: Scene) -> None:
-    trainer = make_trainer(scene)
-    mask = torch.zeros(36, 48, dtype=torch.bool)
-    mask[:, :24] = True
-    view = dataclasses.replace(scene.test[0], mask=mask)
-    spoilt = dataclasses.replace(view, image=torch.where(mask[..., None], view.image, 255 - view.image))
-    model = trainer.model()
-
-    def judge(*views: View, mode: str = "ignore") -> Evaluation:
-        metrics = ("psnr", "ssim", "flip")
-        return evaluate(model, views, mask_mode=mode, metrics=metrics)
-
-    one, other = judge(view), judge(spoilt)
-    assert one["psnr"] == other["psnr"]
-    assert judge(view, mode="background")["psnr"] == judge(spoilt, mode="background")["psnr"] != one["psnr"]
-    with pytest.raises(ValueError, match=r"^metrics: expected some of psnr, ssim, flip, lpips, got 'mse'$"):
-        evaluate(model, [view], metrics=("mse",))
+def test_the_demo_keeps_what_makes_a_preset():
+    """Its own settings are those of a short run on a CPU; the paper's texture stays the paper's."""
+    train = Train(SceneSource("demo"), preset="paper")
+    config, paper = train._config(), preset("paper")
+    assert (config.preset, config.iterations, config.texture.levels) == ("paper", 1200, 12)
+    for name in ("texture.residual", "texture.max_resolution", "losses.depth", "densify.prune_at_cap", "smooth_sh"):
+        assert setting(config, name) == setting(paper, name)
+    assert dataclasses.replace(train, preset="default")._config().texture.residual

@@ -12,7 +12,6 @@ import torch
 import nexwarp as nw
 from nexwarp.data import Scene, View
 from nexwarp.run.evaluate import evaluate
-from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.recipe import Config, DensifyConfig, LearningRates, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.scene_writers import with_exposures
@@ -36,35 +35,22 @@ def mean_psnr(trainer: Trainer, views: list[View]) -> float:
 # Repeatability
 
 
-@pytest.mark.parametrize("stop", [6, 7, 11])
-def test_resuming_changes_nothing(scene, tmp_path, stop):
+@pytest.mark.parametrize(("stop", "max_hits"), [(6, 2), (7, 2), (7, 0)])
+def test_resuming_changes_nothing(scene, tmp_path, stop, max_hits):
     """Straight to 12 = up to `stop`, saved, restored elsewhere, and on to 12: bit for bit."""
-    straight = trained(scene, small())
+    config = small(max_hits=max_hits)
+    straight = trained(scene, config)
     assert len(straight.surfels) > 60  # it has split
-    first = Trainer(scene, small(), "cpu")
+    first = Trainer(scene, config, "cpu")
     for _ in range(stop):
         first.step()
     first.save(tmp_path)
-    second = Trainer(scene, small(), "cpu")
+    second = Trainer(scene, config, "cpu")
     torch.manual_seed(99)
     second.restore(tmp_path)
     assert_same_state(second, first)
     second.run()
     assert_same_state(second, straight)
-
-
-def test_resuming_without_a_texture_changes_nothing(scene, tmp_path):
-    config = small(max_hits=0, iterations=4)
-    straight = trained(scene, config)
-    first, second = Trainer(scene, config, "cpu"), Trainer(scene, config, "cpu")
-    first.step()
-    first.save(tmp_path)
-    second.restore(tmp_path)
-    second.run()
-    for name, value in straight.surfels.state_dict().items():
-        assert torch.equal(second.surfels.state_dict()[name], value), name
-    fresh = Trainer(scene, config, "cpu")
-    assert torch.equal(straight.texture.grid, fresh.texture.grid)  # nothing trains what nothing shows
 
 
 def test_same_seed_same_run_and_other_seeds_differ(scene):
@@ -93,28 +79,6 @@ def test_deterministic_runs_are_the_same_on_cuda(scene):
         assert model.state_dict().keys() == first.state_dict().keys()
         for name, value in first.state_dict().items():
             assert torch.equal(model.state_dict()[name], value), name
-
-
-@pytest.mark.parametrize("damage", ["missing", "shape", "settings", "scene"])
-def test_a_checkpoint_that_does_not_fit_is_refused(scene, tmp_path, damage):
-    trainer = Trainer(scene, small(), "cpu")
-    trainer.step()
-    trainer.save(tmp_path)
-    tensors, state = load_checkpoint(tmp_path)
-    config = small()
-    if damage == "missing":
-        tensors.pop("densify.errors")
-    elif damage == "shape":
-        tensors["texture.grid"] = tensors["texture.grid"][:, :8].contiguous()
-    elif damage == "settings":
-        config = small(iterations=24)
-    else:
-        scene = dataclasses.replace(scene, train=scene.train[:-1])
-    save_checkpoint(tmp_path, tensors, state)
-    with pytest.raises(ValueError) as caught:
-        Trainer(scene, config, "cpu").restore(tmp_path)
-    message = str(caught.value)
-    assert message.startswith(f"{tmp_path}: expected a checkpoint of this run") and "\n" not in message, message
 
 
 # Learning
@@ -150,13 +114,6 @@ def test_progress_tells_what_happened(scene):
     assert max(counts) <= 120
 
 
-def test_budget_holds_in_training(scene):
-    fast = DensifyConfig(every=3, fraction=0.5)
-    trainer, counts = Trainer(scene, small(iterations=15, max_surfels=64, densify=fast), "cpu"), []
-    trainer.run(lambda p: counts.append(p.surfels))
-    assert counts[0] == 32 and max(counts) == 64
-
-
 @pytest.mark.skipif(not FOX.is_dir(), reason=f"{FOX} is not there")
 @pytest.mark.timeout(400)
 def test_it_learns_from_real_photos():
@@ -187,14 +144,6 @@ def test_rates_are_log_linear_between_their_ends(scene):
     assert logs.diff(n=2, dim=0).abs().max() < 1e-9
     for step, row in enumerate(rates):
         assert row[0] == pytest.approx(1.6e-4 * s * 100 ** (-step / 8), rel=1e-9)
-
-
-def test_groups_hold_every_parameter_once(scene):
-    trainer = Trainer(scene, small(), "cpu")
-    grouped = [p for group in trainer.optimizer.param_groups for p in group["params"]]
-    everything = [p for _, p in trainer._named_parameters()]
-    assert len(grouped) == len(everything) and {id(p) for p in grouped} == {id(p) for p in everything}
-    assert all(group["eps"] == 1e-15 and group["betas"] == (0.9, 0.999) for group in trainer.optimizer.param_groups)
 
 
 @pytest.mark.parametrize(("iterations", "every"), [(30_000, 1000), (3000, 100), (60, 2)])
@@ -254,11 +203,6 @@ def test_views_are_drawn_without_replacement(scene):
 
 
 # Scenes
-
-
-def test_a_scene_without_training_views_is_refused(scene):
-    with pytest.raises(ValueError, match="expected at least one training view, got none"):
-        Trainer(dataclasses.replace(scene, train=[]), small(), "cpu")
 
 
 @pytest.mark.parametrize("factor", [64.0, 1 / 64])

@@ -16,8 +16,6 @@ from nexwarp.data import Scene
 from nexwarp.errors import CheckpointError
 from nexwarp.train.recipe import DensifyConfig, TextureConfig
 from nexwarp.train.schedules import OptimizerMaker, ParameterGroup
-from tests.tolerances import assert_close
-from tests.trainer_support import assert_same_state
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 
@@ -51,7 +49,7 @@ def test_python_gives_the_bits_of_the_command_line(tiny_folder: Path, scene: Sce
 
 def test_wrong_arguments_are_named(scene: Scene) -> None:
     wrong: Any
-    for wrong in ({"scene": "demo"}, {"config": {}}, {"callbacks": [3]}, {"losses": {"own": 3}}, {"losses": {3: max}}):
+    for wrong in ({"scene": "demo"}, {"config": {}}, {"callbacks": [3]}, {"losses": {"own": 3}}):
         with pytest.raises(TypeError, match=rf"^{next(iter(wrong))}"):
             nw.train(**({"scene": scene, "config": SMALL, "device": "cpu"} | wrong))
 
@@ -99,11 +97,6 @@ def test_an_own_loss_is_added_and_reported(scene: Scene) -> None:
         assert target.counts is None or target.counts.dtype == torch.bool
 
 
-def test_a_loss_of_zero_changes_nothing(scene: Scene) -> None:
-    own = run(scene, 12, losses={"zero": lambda rendering, target: 0.0 * rendering.alpha.mean()})
-    assert_same_state(own, run(scene, 12))
-
-
 @pytest.mark.parametrize(
     ("losses", "error", "match"),
     [
@@ -123,36 +116,15 @@ def test_losses_that_do_not_fit_are_named(
 # Optimizers
 
 
-def adam(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
-    return torch.optim.Adam(groups, eps=1e-15, fused=True)
-
-
 def radam(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
     return torch.optim.RAdam(groups, eps=1e-15)
-
-
-def adamw(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
-    return torch.optim.AdamW(groups, eps=1e-15, weight_decay=1e-4)
 
 
 def sgd(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
     return torch.optim.SGD([group | {"lr": 2 * group["lr"]} for group in groups], lr=0.0, momentum=0.9)
 
 
-def adagrad(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
-    return torch.optim.Adagrad(groups)
-
-
-def test_adam_by_hand_is_the_default(scene: Scene) -> None:
-    """To rounding, which later steps amplify; test_adam compares more of them."""
-    own, default = run(scene, 1, optimizer=adam), run(scene, 1)
-    for (name, ours), (_, torchs) in zip(default._named_parameters(), own._named_parameters(), strict=True):
-        assert_close(ours, torchs, kind="value", name=name)
-    own.run()
-    assert len(own.surfels) > 60  # surfels were split
-
-
-@pytest.mark.parametrize("make", [radam, adamw, sgd, adagrad])
+@pytest.mark.parametrize("make", [radam, sgd])
 def test_any_optimizer_follows_densification_and_resumes(scene: Scene, tmp_path: Path, make: OptimizerMaker) -> None:
     straight = run(scene, optimizer=make)
     assert len(straight.surfels) > 60
@@ -174,10 +146,9 @@ def test_any_optimizer_follows_densification_and_resumes(scene: Scene, tmp_path:
         nw.Trainer(scene, SMALL, "cpu").restore(tmp_path)
 
 
-@pytest.mark.parametrize(("make", "factor"), [(adam, 1.0), (sgd, 2.0)])
-def test_schedules_drive_the_rates_of_any_optimizer(scene: Scene, make: OptimizerMaker, factor: float) -> None:
+def test_schedules_drive_the_rates_of_any_optimizer(scene: Scene) -> None:
     """From the first rate to the last one; a changed first rate scales both."""
-    trainer, rates = nw.Trainer(scene, SMALL, "cpu", optimizer=make), SMALL.rates
+    trainer, rates = nw.Trainer(scene, SMALL, "cpu", optimizer=sgd), SMALL.rates
     found = []
 
     def note(_: nw.StepReport) -> None:
@@ -185,9 +156,9 @@ def test_schedules_drive_the_rates_of_any_optimizer(scene: Scene, make: Optimize
 
     trainer.run(note)
     for index, end in ((0, found[0]), (1, found[-1])):
-        assert end["means"] == pytest.approx(factor * rates.means[index] * scene.scale)
-        assert end["grid"] == pytest.approx(factor * rates.grid[index])
-        assert end["raw_quats"] == pytest.approx(factor * rates.quats)
+        assert end["means"] == pytest.approx(2 * rates.means[index] * scene.scale)
+        assert end["grid"] == pytest.approx(2 * rates.grid[index])
+        assert end["raw_quats"] == pytest.approx(2 * rates.quats)
 
 
 @pytest.mark.parametrize(
@@ -316,30 +287,18 @@ def changed(index: int, value: Any) -> Callable[[list[Any]], list[Any]]:
     [
         ("images", changed(3, "photo"), TypeError, r"^images\[3\]: expected a torch.Tensor or numpy.ndarray, got str$"),
         ("images", changed(3, torch.zeros(36, 48)), ValueError, r"^images\[3\]: .* \(H, W, 3\), got \(36, 48\)$"),
-        ("images", changed(3, torch.ones(36, 48, 3).int()), TypeError, r"^images\[3\]: expected uint8, .*int32$"),
         ("images", changed(3, torch.ones(36, 48, 3) * 2), ValueError, r"^images\[3\]: .* \[0, 1\], got 2 to 2$"),
-        ("images", changed(3, torch.full((36, 48, 3), torch.nan)), ValueError, r"^images\[3\]: .* got nan to nan$"),
         ("images", changed(3, torch.ones(36, 40, 3)), ValueError, r"^cameras\[3\]: .* 40x36, got 48x36$"),
         ("images", lambda x: [], ValueError, r"^images: expected at least one, got none$"),
-        ("images", iter, TypeError, r"^images: expected a sequence, got list_iterator$"),
         ("cameras", lambda x: x[1:], ValueError, r"^cameras: expected 10, one for each image, got 9$"),
         ("cameras", changed(2, None), TypeError, r"^cameras\[2\]: expected a nexwarp.Camera, got NoneType$"),
         ("points", lambda x: x.long(), TypeError, r"^points: expected a floating dtype, got torch.int64$"),
         ("points", lambda x: x[:, :2], ValueError, r"^points: expected shape \(P, 3\) .*, got \(171, 2\)$"),
         ("points", lambda x: torch.where(x == x[5], torch.inf, x), ValueError, r"^points\[5\]: expected finite"),
-        ("points", lambda x: None, ValueError, r"^colors: expected None without points"),
         ("colors", lambda x: x[1:], ValueError, r"^colors: expected shape \(171, 3\), got \(170, 3\)$"),
-        ("colors", lambda x: None, ValueError, r"^colors: expected one for each of 171 points, got None$"),
-        ("names", changed(4, 4), TypeError, r"^names\[4\]: expected text, got int$"),
         ("names", changed(4, "../x"), ValueError, r"^names\[4\]: '../x' leaves the images folder"),
         ("names", changed(4, "view_002.png"), ValueError, r"^names\[4\]: .* 'view_002.png' as of names\[2\]$"),
         ("masks", changed(1, torch.ones(36, 48)), TypeError, r"^masks\[1\]: expected dtype torch.bool"),
-        (
-            "masks",
-            changed(1, torch.ones(3, 4) > 0),
-            ValueError,
-            r"^masks\[1\]: .* \(36, 48\), got \(3, 4\)$",
-        ),
         (
             "masks",
             changed(1, torch.zeros(36, 48) > 0),
@@ -347,7 +306,6 @@ def changed(index: int, value: Any) -> Callable[[list[Any]], list[Any]]:
             r"^masks\[1\]: .* that count, got none$",
         ),
         ("test_every", lambda x: 1, ValueError, r"^test_every: expected 0, or at least 2, got 1$"),
-        ("test_every", lambda x: 2.0, TypeError, r"^test_every: expected an int, got float$"),
     ],
 )
 def test_what_makes_no_scene_is_named(
@@ -356,10 +314,3 @@ def test_what_makes_no_scene_is_named(
     given = parts(scene) | {"masks": [None] * 10, "test_every": 8}
     with pytest.raises(error, match=match):
         nw.Scene.from_tensors(**given | {argument: change(given[argument])})
-
-
-def test_one_image_needs_all_views_for_training(scene: Scene) -> None:
-    one = {name: x[:1] for name, x in parts(scene).items() if name not in ("points", "colors")}
-    with pytest.raises(ValueError, match=r"^test_every: expected 0 for 1 image"):
-        nw.Scene.from_tensors(**one)
-    assert len(nw.Scene.from_tensors(**one, test_every=0).train) == 1

@@ -1,0 +1,134 @@
+"""What training makes of backgrounds and masks."""
+
+import dataclasses
+from typing import Any
+
+import pytest
+import torch
+
+from nexwarp.data import Scene, View
+from nexwarp.run.evaluate import Evaluation, evaluate
+from nexwarp.train.recipe import Config, TextureConfig
+from nexwarp.train.trainer import Trainer
+from nexwarp.train.views import mean_color
+from tests.tolerances import assert_close
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
+TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
+
+
+@pytest.fixture(scope="session")
+def scene(tiny_scene: Scene) -> Scene:
+    return tiny_scene
+
+
+def make_trainer(scene: Scene, **settings) -> Trainer:
+    values: dict[str, Any] = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE} | settings
+    return Trainer(scene, Config(**values), "cpu")
+
+
+def test_background_is_the_given_one_the_scenes_or_the_mean(scene: Scene) -> None:
+    photos = torch.stack([view.image for view in scene.train]).double() / 255
+    assert mean_color(scene.train) == pytest.approx(photos.mean((0, 1, 2)).tolist(), abs=1e-9)
+    assert make_trainer(scene).render_options().background == mean_color(scene.train)
+    black = make_trainer(scene, background=(0.0, 0.0, 0.0))
+    assert black.render_options().background == (0.0, 0.0, 0.0)
+    white = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))
+    assert make_trainer(white).render_options().background == (1.0, 1.0, 1.0)
+
+
+def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) -> None:
+    alpha = torch.full((36, 48), 255, dtype=torch.uint8)
+    alpha[:10] = 51
+    views = [dataclasses.replace(v, alpha=alpha) for v in scene.train]
+    random = dataclasses.replace(scene, train=views, background=(1.0, 1.0, 1.0), random_background=True)
+    trainer = make_trainer(random)
+    seen = [trainer.targets.from_view(0) for _ in range(3)]
+    colors = [torch.as_tensor(view.background) for view in seen]
+    assert len({tuple(color.tolist()) for color in colors}) == 3
+    photo = views[0].image.float() / 255
+    for view, color in zip(seen, colors, strict=True):
+        expected = photo[:10] + 0.8 * (color - 1.0)
+        assert_close(view.photo[:10], expected, kind="value", name="transparent")
+        assert_close(view.photo[10:], photo[10:], kind="value", name="opaque")
+    assert trainer.render_options().background == (1.0, 1.0, 1.0)
+
+
+# Masks
+
+SQUARE = slice(10, 26), slice(14, 34)
+
+
+def with_intruder(scene: Scene, masked: bool) -> Scene:
+    """A red square before every training photo, and masks that leave it out."""
+    mask = torch.ones(36, 48, dtype=torch.bool)
+    mask[SQUARE] = False
+
+    def spoilt(view: View) -> View:
+        image = view.image.clone()
+        image[SQUARE] = torch.tensor([255, 0, 0], dtype=torch.uint8)
+        return dataclasses.replace(view, image=image, mask=mask if masked else None)
+
+    return dataclasses.replace(scene, train=[spoilt(view) for view in scene.train])
+
+
+def redness(trainer: Trainer) -> float:
+    """How much redder than their photos the test views are, in the middle, 0 to 1."""
+    views = trainer.scene.test
+    with torch.no_grad():
+        images = [out.image for out in trainer.model().render([view.camera for view in views])]
+    pairs = [(image[SQUARE], view.image[SQUARE] / 255) for image, view in zip(images, views, strict=True)]
+    return sum(((a[..., 0] - a[..., 2]) - (b[..., 0] - b[..., 2])).mean().item() for a, b in pairs) / len(pairs)
+
+
+@pytest.mark.timeout(120)
+def test_what_masks_leave_out_does_not_appear(scene: Scene) -> None:
+    """An intruder that moves with the camera, before every photo; learnt without masks, left out with them."""
+    settings = {"iterations": 120, "max_surfels": 400}
+    results = []
+    for masked in (False, True):
+        trainer = make_trainer(with_intruder(scene, masked), **settings)
+        trainer.run()
+        results.append(redness(trainer))
+    without, with_masks = results
+    assert without > 0.08
+    assert abs(with_masks) < 0.2 * without
+
+
+def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
+    mask = torch.zeros(36, 48, dtype=torch.bool)
+    mask[:, :24] = True
+    views = [dataclasses.replace(view, mask=mask) for view in scene.train]
+    halves = dataclasses.replace(scene, train=views)
+    alphas = {}
+    for mode in ("ignore", "background"):
+        trainer = make_trainer(halves, iterations=60, mask_mode=mode)
+        trainer.run()
+        with torch.no_grad():
+            view = trainer.targets.from_view(0)
+            outs = trainer.model().render([v.camera for v in scene.train])
+        alphas[mode] = torch.stack([out.alpha[:, 30:] for out in outs]).mean().item()
+        if mode == "background":
+            assert (view.photo[:, 24:] == torch.tensor(trainer.background)).all()
+            assert view.counts is None and view.empty is not None and torch.equal(view.empty, ~mask)
+    assert alphas["background"] < 0.75 * alphas["ignore"]
+
+
+def test_masks_take_part_in_the_judgement(scene: Scene) -> None:
+    trainer = make_trainer(scene)
+    mask = torch.zeros(36, 48, dtype=torch.bool)
+    mask[:, :24] = True
+    view = dataclasses.replace(scene.test[0], mask=mask)
+    spoilt = dataclasses.replace(view, image=torch.where(mask[..., None], view.image, 255 - view.image))
+    model = trainer.model()
+
+    def judge(*views: View, mode: str = "ignore") -> Evaluation:
+        metrics = ("psnr", "ssim", "flip")
+        return evaluate(model, views, mask_mode=mode, metrics=metrics)
+
+    one, other = judge(view), judge(spoilt)
+    assert one["psnr"] == other["psnr"]
+    assert judge(view, mode="background")["psnr"] == judge(spoilt, mode="background")["psnr"] != one["psnr"]
+    with pytest.raises(ValueError, match=r"^metrics: expected some of psnr, ssim, flip, lpips, got 'mse'$"):
+        evaluate(model, [view], metrics=("mse",))
