@@ -11,8 +11,8 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.ops.startup import start_warp
 from nexwarp.run.evaluate import evaluate
+from nexwarp.train.densify import least_contributing
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
-from nexwarp.train.relocation import least_contributing
 from nexwarp.train.trainer import Trainer
 
 WIDTH, HEIGHT, POINTS = 64, 48, 100

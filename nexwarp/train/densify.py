@@ -1,8 +1,16 @@
-"""Adaptive density control (paper Sec. 4.3): splits surfels of large blended error, prunes transparent ones."""
+"""Adaptive density control (paper Sec. 4.3): splits surfels of large blended error, prunes transparent ones.
+
+Once the budget is used up, the paper's density control splits a surfel only where another becomes transparent: few do.
+Relocation, which the paper does not have, therefore removes the surfels that the training views need least.
+"""
+
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import nn
 
+from nexwarp.cameras.camera import Camera, reduced
+from nexwarp.model.model import Model
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.train.recipe import DensifyConfig
 
@@ -33,6 +41,15 @@ class Densifier:
         c = self.config
         rare = iteration // c.every % RELOCATE_EVERY == 0
         return c.relocate > 0 and rare and iteration < RELOCATE_UNTIL * c.stop and count >= FULL * self.max_surfels
+
+    def unneeded(
+        self,
+        model: Model,
+        cameras: Sequence[Camera],
+        largest: Callable[[torch.Tensor], torch.Tensor] = lambda values: values,
+    ) -> torch.Tensor:
+        """Return the surfels (N,) bool to relocate; see `least_contributing`."""
+        return least_contributing(model, cameras, self.config.relocate, largest)
 
     def accumulate(self, errors: torch.Tensor) -> None:
         """Add the blended errors (N,) of one view."""
@@ -182,3 +199,27 @@ def replace_rows(surfels: Surfels, optimizer: torch.optim.Optimizer, rows: torch
 def has_rows_of(value: object, parameter: torch.Tensor) -> bool:
     """Whether a value of an optimizer's state holds a number for each number of the parameter."""
     return isinstance(value, torch.Tensor) and value.shape == parameter.shape
+
+
+@torch.no_grad()
+def least_contributing(
+    model: Model,
+    cameras: Sequence[Camera],
+    share: float,
+    largest: Callable[[torch.Tensor], torch.Tensor] = lambda values: values,
+) -> torch.Tensor:
+    """Return (N,) bool, True for the share of the surfels that contribute least to any image.
+
+    A surfel's contribution to an image is the sum of its blending weights over the pixels; what counts is the image to
+    which it contributes most. Images are rendered at half the size, each weighing all its pixels alike. `largest` takes
+    the contributions (N,) to these images, and returns the largest of all ranks.
+    """
+    bare = model.bare()
+    most = torch.zeros_like(bare.surfels.logit_opacities)
+    for camera in cameras:
+        out = bare.render(reduced(camera, max(camera.height // 2, 1)))
+        most = torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1.0 / out.alpha.numel())))
+    most = largest(most)
+    chosen = torch.zeros(len(most), dtype=torch.bool, device=most.device)
+    chosen[most.argsort(stable=True)[: int(share * len(most))]] = True
+    return chosen

@@ -23,7 +23,6 @@ from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.checkpoint import Snapshot
 from nexwarp.train.ranks.ranks import GradientReducer, Ranks
 from nexwarp.train.recipe import Config
-from nexwarp.train.relocation import least_contributing
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 
@@ -137,9 +136,8 @@ class ParallelTrainer(Trainer):
         super()._update(self.reducer.finish(self._trained(), errors))
 
     def _unneeded(self) -> torch.Tensor:
-        ranks, cameras = self.ranks, self.views.refined_cameras(self.poses)
-        mine, share = cameras[ranks.rank :: ranks.size], self.config.densify.relocate
-        return least_contributing(self.model(), mine, share, ranks.largest)
+        cameras = self.views.refined_cameras(self.poses)[self.ranks.rank :: self.ranks.size]
+        return self.densifier.unneeded(self.model(), cameras, self.ranks.largest)
 
     def _trained(self) -> list[nn.Parameter]:
         return [x for group in self.optimizer.param_groups for x in group["params"]]

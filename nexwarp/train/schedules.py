@@ -3,13 +3,15 @@
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import torch
 
+from nexwarp.model.options import RenderOptions
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture
+from nexwarp.ops.tiles import Order
 from nexwarp.train.adam import FusedAdam, grid_factors
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config, DensifyConfig
 
@@ -108,6 +110,19 @@ def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int,
             group["lr"].fill_(rate)
         else:
             group["lr"] = rate
+
+
+def options_at(
+    config: Config, iteration: int, background: tuple[float, float, float], texture_degree: int
+) -> RenderOptions:
+    """Return how the scene is rendered after an iteration: more hits and SH degrees are unlocked on the way."""
+    unlocked = iteration // config.scaled(config.sh_every)
+    return RenderOptions(
+        max_hits=config.hits_at(iteration),
+        background=background,
+        sh_degree=min(max(config.sh_degree, texture_degree), unlocked),
+        order=cast(Order, config.order),
+    )
 
 
 def densify_schedule(config: Config) -> DensifyConfig:

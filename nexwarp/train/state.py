@@ -2,14 +2,19 @@
 
 import dataclasses
 import hashlib
+import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene
-from nexwarp.errors import check_finite
+from nexwarp.errors import CheckpointError, check_finite
+from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
 from nexwarp.model.bounds import check_bounds
 from nexwarp.model.surfels import PARAMETERS, Surfels
@@ -78,6 +83,22 @@ class TrainingState:
         """Yield all parameters with their names in a checkpoint."""
         for part, module in self._parts().items():
             yield from ((f"{part}.{name}", x) for name, x in module.named_parameters())
+
+    def take_grid_loss(self) -> dict[str, torch.Tensor]:
+        """Return the grid's term of the loss, where the optimizer computes it, once after each of its steps."""
+        if not isinstance(self.optimizer, FusedAdam) or self.optimizer.grid_loss is None:
+            return {}
+        loss, self.optimizer.grid_loss = self.optimizer.grid_loss, None
+        return {"grid": loss}
+
+    def facts(self) -> dict[str, Json]:
+        """Return what a model says of its training; see `Model.meta`."""
+        near, scale = self.scene.train[0].camera.near, self.scene.scale
+        return {"near": near, "scene_scale": scale, "preset": self.config.preset, "iteration": self.iteration}
+
+    def save_cameras(self, folder: str | os.PathLike[str]) -> None:
+        """Write the scene's cameras into a folder, so that a model there can be rendered from them."""
+        save_cameras(Path(folder, CAMERAS_FILE), self.scene.cameras)
 
     def snapshot(self) -> Snapshot:
         """Return copies on the CPU of everything that shapes the future."""
@@ -171,6 +192,16 @@ def restore_optimizer(
             }
         if values:
             optimizer.state[parameter] = values
+
+
+@contextmanager
+def checkpoint_errors(run: Path | str) -> Iterator[None]:
+    """Turn whatever a snapshot that does not fit raises into one CheckpointError."""
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
+        reason = one_line(f"it has no {error}" if isinstance(error, KeyError) else str(error))  # torch's are long
+        raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
 
 
 def check_origin(origin: Mapping[str, Any], config: Config, state: Mapping[str, Any], *, extend: bool = False) -> None:

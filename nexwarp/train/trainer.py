@@ -5,31 +5,24 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import cached_property, partial, reduce
 from pathlib import Path
-from typing import cast
 
 import torch
 
-from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene
-from nexwarp.errors import CheckpointError, DivergedError, OutOfMemoryError, SceneError
-from nexwarp.io.files import one_line
-from nexwarp.io.json_files import Json
+from nexwarp.errors import DivergedError, OutOfMemoryError, SceneError
 from nexwarp.machine import deterministic, needed_memory, seed_everything, torch_threads
 from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, can_capture, graph_key, updating
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.render import draw
-from nexwarp.ops.tiles import Order
-from nexwarp.train.adam import FusedAdam
 from nexwarp.train.checkpoint import Snapshot, load_checkpoint, save_checkpoint
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.finish.finish import FinishObserver, finish_model
 from nexwarp.train.health import Health, oom_message, watched_tensors
 from nexwarp.train.recipe import Config
-from nexwarp.train.relocation import least_contributing
 from nexwarp.train.report import StepReport
-from nexwarp.train.schedules import OptimizerMaker, set_rates
-from nexwarp.train.state import TrainingState, check_origin, check_snapshot, scene_digest
+from nexwarp.train.schedules import OptimizerMaker, options_at, set_rates
+from nexwarp.train.state import TrainingState, check_origin, check_snapshot, checkpoint_errors, scene_digest
 from nexwarp.train.step_losses import OwnLoss, as_taken, check_own_losses, step_losses
 from nexwarp.train.target import Target, refined
 from nexwarp.train.teachers import check_teachers, make_targets
@@ -37,8 +30,6 @@ from nexwarp.train.teachers import check_teachers, make_targets
 CHECK_EVERY = 100  # iterations between checks that all numbers are finite
 SNAPSHOTS = 10  # that a run takes, one replacing the other
 LOWERED_RATES = 0.5  # factor of the rates after a run has gone back
-# What a snapshot that does not fit raises.
-MISFITS = (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError)
 
 
 class Trainer(TrainingState):
@@ -199,13 +190,6 @@ class Trainer(TrainingState):
             losses |= self.take_grid_loss()
         return StepResult(losses, image, room, gradients)
 
-    def take_grid_loss(self) -> dict[str, torch.Tensor]:
-        """Return the grid's term of the loss, where the optimizer computes it, once after each of its steps."""
-        if not isinstance(self.optimizer, FusedAdam) or self.optimizer.grid_loss is None:
-            return {}
-        loss, self.optimizer.grid_loss = self.optimizer.grid_loss, None
-        return {"grid": loss}
-
     def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
         return loss
 
@@ -227,8 +211,7 @@ class Trainer(TrainingState):
         self.densifier.step(self.surfels, self.optimizer, self.generator, unneeded)
 
     def _unneeded(self) -> torch.Tensor:
-        cameras = self.views.refined_cameras(self.poses)
-        return least_contributing(self.model(), cameras, self.config.densify.relocate)
+        return self.densifier.unneeded(self.model(), self.views.refined_cameras(self.poses))
 
     def _graph_key(self) -> GraphKey:
         tensors = [self.densifier.errors, *(parameter for _, parameter in self._named_parameters())]
@@ -237,22 +220,11 @@ class Trainer(TrainingState):
 
     def model(self) -> Model:
         """Return the model as it is now: the trainer's own surfels and texture, at the photos' mean exposure."""
-        near, scale = self.scene.train[0].camera.near, self.scene.scale
-        meta: dict[str, Json] = {"near": near, "scene_scale": scale}
-        meta |= {"preset": self.config.preset, "iteration": self.iteration}
-        return Model(self.surfels, self.texture, options=self.render_options(), meta=meta)
+        return Model(self.surfels, self.texture, options=self.render_options(), meta=self.facts())
 
     def render_options(self) -> RenderOptions:
-        """Return how the scene is rendered at this point of the run: hits and SH degrees are unlocked on the way."""
-        config = self.config
-        return RenderOptions(
-            max_hits=config.hits_at(self.iteration),
-            background=self.background,
-            sh_degree=min(
-                max(config.sh_degree, self.texture.sh_degree), self.iteration // config.scaled(config.sh_every)
-            ),
-            order=cast(Order, config.order),
-        )
+        """Return how the scene is rendered at this point of the run."""
+        return options_at(self.config, self.iteration, self.background, self.texture.sh_degree)
 
     def finish(self, observe: FinishObserver = lambda *_: None) -> Model:
         """Return a finished model of new surfels and the trainer's texture: smooth SH, detail limits, exposures."""
@@ -275,7 +247,7 @@ class Trainer(TrainingState):
         Path(folder).mkdir(parents=True, exist_ok=True)
         self.save_checkpoint(Path(folder))
         self.model().save(folder)
-        save_cameras(Path(folder, CAMERAS_FILE), self.scene.cameras)
+        self.save_cameras(folder)
 
     def save_checkpoint(self, run: Path) -> None:
         """Write a checkpoint into a folder; DivergedError where something is not finite, OSError on a failing disk."""
@@ -300,13 +272,10 @@ class Trainer(TrainingState):
             CheckpointError: they are damaged, or scene, settings, optimizer or teachers differ.
         """
         snapshot = self._read(Path(run), warn)
-        try:
+        with checkpoint_errors(run):
             check_origin(self.origin, self.config, snapshot.state, extend=extend)
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
-        except MISFITS as error:
-            reason = one_line(f"it has no {error}" if isinstance(error, KeyError) else str(error))  # torch's are long
-            raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
 
     def snapshot(self) -> Snapshot:
         """Return everything that shapes the future of the run, as copies on the CPU, and where it comes from."""

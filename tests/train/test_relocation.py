@@ -9,12 +9,10 @@ import torch
 from nexwarp.cameras.camera import Camera, reduced
 from nexwarp.data import Scene
 from nexwarp.model.render import render
-from nexwarp.train import relocation
-from nexwarp.train import trainer as trainer_module
-from nexwarp.train.densify import Densifier
+from nexwarp.train import densify
+from nexwarp.train.densify import Densifier, least_contributing
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import DensifyConfig
-from nexwarp.train.relocation import least_contributing
 from nexwarp.train.trainer import Trainer
 from tests.ranks_support import run_ranks
 from tests.scenes import make_surfels, random_scene
@@ -62,7 +60,7 @@ def test_ranks_share_the_views(scene: Scene, tmp_path: Path) -> None:
 
     def work(ranks: Ranks) -> object:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(relocation, "reduced", noted)
+            patch.setattr(densify, "reduced", noted)
             mine = cameras[ranks.rank :: ranks.size]
             return least_contributing(model, mine, 0.3, ranks.largest).tolist(), len(rendered)
 
@@ -86,11 +84,11 @@ def test_rounds_at_the_budget_relocate_in_the_first_part_of_density_control() ->
 def test_others_take_their_place(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     removed = []
 
-    def first(model, cameras, share):
+    def first(model, cameras, share, _):
         removed.append((trainer.iteration, len(model.surfels), len(cameras), share))
         return torch.arange(len(model.surfels)) < share * len(model.surfels)
 
-    monkeypatch.setattr(trainer_module, "least_contributing", first)
+    monkeypatch.setattr(densify, "least_contributing", first)
     config = small(iterations=120, densify=dataclasses.replace(OFTEN, relocate=0.2, prune_opacity=0.0, fraction=0.2))
     budget = 50
     trainer = Trainer(scene, dataclasses.replace(config, max_surfels=budget), "cpu")
