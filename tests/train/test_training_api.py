@@ -101,7 +101,7 @@ def test_an_own_loss_is_added_and_reported(scene: Scene) -> None:
     ("losses", "error", "match"),
     [
         ({"l1": lambda r, t: r.alpha.mean()}, ValueError, r"expected names other than l1, .*, got 'l1'"),
-        ({"own": lambda r, t: r.alpha}, ValueError, r"losses\['own'\]: expected a scalar tensor, got shape \(36, 48\)"),
+        ({"own": lambda r, t: r.alpha}, ValueError, r"losses\['own'\]: expected a scalar tensor on cpu, got shape \(36, 48\)"),
         ({"own": lambda r, t: 0.5}, TypeError, r"losses\['own'\]: expected a floating scalar tensor, got float"),
         ({"own": lambda r, t: r.ids.sum()}, TypeError, r"losses\['own'\]: .*, got torch\.int64"),
     ],
