@@ -15,7 +15,7 @@ from nexwarp.model.detail import ORDERED
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load
 from nexwarp.run.folder import CONFIG_FILE, read_run
-from nexwarp.train.finish.order import ordered
+from nexwarp.train.finish.finish import ordered
 from nexwarp.train.recipe import Config
 
 

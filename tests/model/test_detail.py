@@ -11,7 +11,7 @@ from nexwarp.cli import main as cli
 from nexwarp.model.detail import coarse_texture, surfel_count, texture_levels
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.run.opened import open_model
-from nexwarp.train.finish.order import ordered, picture_shares
+from nexwarp.train.finish.finish import ordered, picture_shares
 from tests.cameras.test_paths import ring
 from tests.cli.support import refused
 from tests.scenes import make_surfels, make_texture, random_scene

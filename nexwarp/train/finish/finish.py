@@ -1,24 +1,27 @@
 """Turns trained surfels into a finished model."""
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import TypeVar
 
-from nexwarp.cameras.camera import Camera
+import torch
+
+from nexwarp.cameras.camera import Camera, reduced
 from nexwarp.data import View
 from nexwarp.machine import deterministic
+from nexwarp.model.detail import ORDERED, pick_surfels
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
 from nexwarp.train.finish.detail_limits import measure_detail_limits
-from nexwarp.train.finish.order import ordered
 from nexwarp.train.finish.sh_smoothing import smooth_sh
 from nexwarp.train.recipe import Config
 from nexwarp.train.views import with_cameras
 
 FinishObserver = Callable[[str, int, int], None]
 Item = TypeVar("Item")
+HEIGHT = 540  # pixels of the pictures that shares are measured in, at most
 
 
 def finish_model(
@@ -58,3 +61,24 @@ def counted(items: Sequence[Item], stage: str, observe: FinishObserver) -> Itera
     for done, item in enumerate(items, 1):
         yield item
         observe(stage, done, len(items))
+
+
+@torch.no_grad()
+def picture_shares(model: Model, cameras: Iterable[Camera]) -> torch.Tensor:
+    """Return the sums (N,) of each surfel's blending weights over all pictures, each by its mean over the pixels."""
+    bare = model.bare()
+    shares = torch.zeros_like(model.surfels.logit_opacities)
+    for camera in cameras:
+        out = bare.render(reduced(camera, HEIGHT))
+        shares += out.splat_error(torch.full_like(out.alpha, 1.0 / out.alpha.numel()))
+    return shares
+
+
+def ordered(model: Model, cameras: Iterable[Camera]) -> Model:
+    """Return a model with the same surfels, those of the largest shares of the cameras' pictures first."""
+    if not len(model.surfels):
+        return model
+    shares = picture_shares(model, cameras)
+    result = pick_surfels(model, shares.argsort(descending=True, stable=True))
+    result.meta[ORDERED] = True
+    return result
