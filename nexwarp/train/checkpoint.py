@@ -98,8 +98,8 @@ def load_checkpoint(run: Path, warn: Callable[[str], None] = lambda _: None) -> 
         except CheckpointError as error:
             damaged.append(error)
             continue
-        for error in damaged:
-            warn(f"{error}; going back to the one before it, {folder.name}")
+        for fault in damaged:
+            warn(f"{fault}; going back to the one before it, {folder.name}")
         return snapshot
     if damaged:
         raise damaged[0]

@@ -144,13 +144,6 @@ def test_paper_is_the_paper():
     )
 
 
-def test_default_prunes_at_the_cap_and_filters_points():
-    p = preset("default")
-    assert p == Config() and p.densify.prune_at_cap and p.filter_points
-    assert p.texture.min_resolution is None and p.texture.max_resolution is None
-    assert p.texture.residual and p.background is None and p.losses.depth > 0
-
-
 def test_unknown_preset_is_refused():
     with pytest.raises(ValueError, match=r"^preset: expected one of default, paper, web, got 'papr'$"):
         preset("papr")

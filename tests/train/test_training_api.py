@@ -274,14 +274,6 @@ def test_a_scene_in_memory_keeps_copies_and_trains(scene: Scene) -> None:
     assert len(model.surfels) > 0 and model.meta["iteration"] == 8
 
 
-def test_without_points_a_scene_gets_random_ones(scene: Scene) -> None:
-    given = parts(scene)
-    made = nw.Scene.from_tensors(given["images"], given["cameras"])
-    assert len(made.points) == len(made.colors) > 1000 and made.colors.dtype == torch.uint8
-    again = nw.Scene.from_tensors(given["images"], given["cameras"])
-    assert torch.equal(made.points, again.points)
-
-
 def changed(index: int, value: Any) -> Callable[[list[Any]], list[Any]]:
     return lambda values: [value if i == index else x for i, x in enumerate(values)]
 
