@@ -1,7 +1,9 @@
-"""The loss terms that compare pixel by pixel: the L1 of the image, of the texture, and the weight that has no texture.
+"""What compares an image with a photo pixel by pixel: a thread is a pixel.
+
+The loss terms are the L1 of the image, of the texture, and the weight that has no texture.
 
 With S = sum_k W, a pixel's share is |image - target|, |textured / (S + eps) - target| (both summed over the channels)
-and 1 - S, each times a scale, which holds the term's factor and the number of values. One thread a pixel; a term whose
+and 1 - S, each times a scale, which holds the term's factor and the number of values. A term whose
 output, or whose incoming gradient, is a null array is left out. At a difference of 0 an L1 has the gradient 0. A
 channel whose target is at least `saturation` has a difference of 0 from any brighter value.
 """
@@ -122,3 +124,74 @@ def photometric_kernels(real: type) -> SimpleNamespace:
                 grad_weights[p, h] = change
 
     return SimpleNamespace(forward=photometric, backward=photometric_backward)
+
+
+@functools.cache
+def expose_kernels(real: type) -> SimpleNamespace:
+    """Make the kernel that renders to a photo's exposure, and its derivative (not in the paper).
+
+    With e the exposure's gains times its falloff, one for all pixels or one a pixel:
+
+        exposed         e * image, or the photo's value where that is saturated and e * image brighter
+        exposed_colors  e * textured
+
+    Where the photo's value is taken there is no gradient.
+    """
+    t = types(real)
+    vec3, ZERO = t.vec3, t.ZERO
+
+    @wp.func
+    def factor(p: int, exposure: wp.array(dtype=vec3)):
+        if exposure.shape[0] == 1:
+            return exposure[0]
+        return exposure[p]
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def expose(
+        first: wp.int32,
+        image: wp.array(dtype=vec3),
+        textured: wp.array(dtype=vec3),
+        exposure: wp.array(dtype=vec3),
+        photo: wp.array(dtype=vec3),
+        saturation: real,
+        # outputs
+        exposed: wp.array(dtype=vec3),
+        exposed_colors: wp.array(dtype=vec3),
+    ):
+        p = first + wp.tid()
+        e = factor(p, exposure)
+        x = wp.cw_mul(image[p], e)
+        y = photo[p]
+        for k in range(3):
+            if y[k] >= saturation and x[k] > y[k]:
+                x[k] = y[k]
+        exposed[p] = x
+        exposed_colors[p] = wp.cw_mul(textured[p], e)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def expose_backward(  # noqa: PLR0913  # a kernel entry point
+        first: wp.int32,
+        image: wp.array(dtype=vec3),
+        exposure: wp.array(dtype=vec3),
+        photo: wp.array(dtype=vec3),
+        saturation: real,
+        grad_exposed: wp.array(dtype=vec3),
+        grad_exposed_colors: wp.array(dtype=vec3),
+        # outputs
+        grad_image: wp.array(dtype=vec3),
+        grad_textured: wp.array(dtype=vec3),
+    ):
+        p = first + wp.tid()
+        e = factor(p, exposure)
+        if grad_exposed:
+            x = wp.cw_mul(image[p], e)
+            y = photo[p]
+            g = wp.cw_mul(grad_exposed[p], e)
+            for k in range(3):
+                if y[k] >= saturation and x[k] > y[k]:
+                    g[k] = ZERO
+            grad_image[p] = g
+        if grad_exposed_colors:
+            grad_textured[p] = wp.cw_mul(grad_exposed_colors[p], e)
+
+    return SimpleNamespace(forward=expose, backward=expose_backward)

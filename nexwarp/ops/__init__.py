@@ -4,10 +4,10 @@ from nexwarp.ops.activate import activate
 from nexwarp.ops.collect import Hits, SplatErrorRequest, collect, splat_error
 from nexwarp.ops.compose import compose
 from nexwarp.ops.detail import antialias, limit_depths
-from nexwarp.ops.expose import expose
 from nexwarp.ops.graphs import captured
 from nexwarp.ops.memory import check_image
 from nexwarp.ops.neural_field import Field, Points, Rays
+from nexwarp.ops.photometric import expose
 from nexwarp.ops.project import Pinhole, Projection, project
 from nexwarp.ops.sh import plain_colors
 from nexwarp.ops.surface import DifferentiableSurface, Surface, surface

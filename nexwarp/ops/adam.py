@@ -6,9 +6,10 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
-from nexwarp.kernels.adam import CPU_VALUES, VALUES, adam_kernel
+from nexwarp.kernels.adam import CPU_VALUES, VALUES, Adam
+from nexwarp.kernels.adam import adam_step as step_kernel
 from nexwarp.kernels.launch import Sharing
-from nexwarp.ops._interop import array, launch
+from nexwarp.ops._interop import array, launch, struct
 
 SMALLEST_SHARE = 64  # threads of a chunk on a CPU, at least
 
@@ -62,14 +63,29 @@ def adam_step(
         if parameter.is_cuda:
             threads = -(-threads // 32) * 32  # whole warps, which add up what their lanes have
         losses = parameter.new_empty(threads // 32 if parameter.is_cuda else threads)
-    given = [None if grad is None else _aligned(grad).view(-1), factors]
-    nothing = parameter.new_empty(0)
-    inputs = [*(array(nothing if x is None else x, wp.float32) for x in given), level_bits]
-    inputs += [array(x.view(1), wp.float32) for x in (moments.step, rate)]
-    inputs += [*betas, *(1.0 - beta for beta in betas), *(math.log(beta) for beta in betas), epsilon]
-    outputs = [array(x.view(-1), wp.float32) for x in (parameter, moments.mean, moments.square)]
-    outputs += [array(nothing.half() if half is None else half.view(-1), wp.float16), array(losses, wp.float32)]
-    launch(parameter, adam_kernel(), threads, inputs, outputs, sharing=Sharing(SMALLEST_SHARE))
+    arrays = {
+        "values": parameter.view(-1),
+        "means": moments.mean.view(-1),
+        "squares": moments.square.view(-1),
+        "grads": None if grad is None else _aligned(grad).view(-1),
+        "factors": factors,
+        "step": moments.step.view(1),
+        "rates": rate.view(1),
+    }
+    adam = struct(
+        Adam,
+        **{name: array(x, wp.float32) for name, x in arrays.items()},
+        halves=array(None if half is None else half.view(-1), wp.float16),
+        level_bits=level_bits,
+        beta1=betas[0],
+        beta2=betas[1],
+        rest1=1.0 - betas[0],
+        rest2=1.0 - betas[1],
+        log_beta1=math.log(betas[0]),
+        log_beta2=math.log(betas[1]),
+        epsilon=epsilon,
+    )
+    launch(parameter, step_kernel, threads, [adam], [array(losses, wp.float32)], sharing=Sharing(SMALLEST_SHARE))
     return None if factors is None else losses.sum()
 
 
