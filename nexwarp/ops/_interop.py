@@ -1,7 +1,9 @@
 """The torch <-> Warp boundary: arrays, types, devices and streams."""
 
+import ctypes
 import functools
 import os
+import sys
 import threading
 from collections.abc import Sequence
 from typing import Any, TypeAlias
@@ -12,7 +14,6 @@ import warp as wp
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.tiles import LARGEST_INT
 from nexwarp.native.fixed_point import HIGH, LOW
-from nexwarp.ops.startup import start_warp
 
 # What a kernel is launched with: arrays, scalars, vectors, or None for an array that is not there.
 Argument: TypeAlias = object
@@ -85,6 +86,40 @@ def struct(kind: Any, **fields: Argument) -> Argument:
             setattr(value, name, field)
     value.fields = fields  # views of arrays keep their tensors alive
     return value
+
+
+# Warp prints a banner when it starts, and a line for each module that it loads: users of nexwarp do not know these.
+if wp.config.log_level == wp.LOG_INFO:
+    wp.config.log_level = wp.LOG_WARNING
+DRIVERS = ("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so", "libcuda.so.1")
+
+
+@functools.cache  # looking for the driver takes as long as a launch
+def start_warp() -> None:
+    """Initialise Warp; without the NVIDIA driver, its warning of that, which Python does not see, is not printed."""
+    if any(_can_load(name) for name in DRIVERS):
+        wp.init()
+        return
+    try:
+        stderr = os.dup(2)
+    except OSError:  # closed
+        wp.init()
+        return
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        wp.init()
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
+
+
+def _can_load(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
 
 
 @functools.lru_cache(maxsize=64)

@@ -33,9 +33,8 @@ from nexwarp.ops.tiles import Tiles
 class SplatErrorRequest:
     """Request that the backward pass also adds up blended errors; see `Rendering.request_splat_error`.
 
-    Attributes:
-        errors: (H, W) error of each pixel, set between forward and backward; None requests nothing.
-        sums_after_backward: (N,) what `splat_error` would return; the backward pass sets it.
+    `errors` (H, W) of the pixels are set between forward and backward, `sums_after_backward` (N,), what `splat_error`
+    would return, by the backward pass.
     """
 
     errors: torch.Tensor | None = None
@@ -246,10 +245,7 @@ def _backward(
     grads: tuple[torch.Tensor, ...],
     errors: torch.Tensor | None,
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Gradients of the records (N, 4, 4), and sums of weight * error (N,) where there are errors (H, W).
-
-    `outputs` are those of `collect`, and `grads` those of the differentiable ones.
-    """
+    """Gradients of the records (N, 4, 4), and sums of weight * error (N,) where there are errors (H, W)."""
     real, max_hits = scene.real, outputs[2].shape[-1]
     t = types(real)
     plain, base, depths, weights, alphas = (x.contiguous() for x in grads)

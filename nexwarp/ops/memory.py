@@ -25,10 +25,6 @@ def check_image(
         real: dtype of the surfels.
         device: of the surfels.
         texture: number of values that the texture keeps for each hit, 0 without a texture; their dtype.
-
-    Raises:
-        ValueError: pixels or hits are too many for int32.
-        OutOfMemoryError: memory does not suffice.
     """
     image, advice = f"{width}x{height}", "render the image in parts (Camera.crop)"
     padded = -(-width // 16) * 16 * -(-height // 16) * 16
@@ -51,10 +47,9 @@ def check_image(
 
 
 def check_memory(needed: int, device: torch.device, task: str) -> None:
-    """Raise OutOfMemoryError if a device cannot hold `needed` bytes at all, or a computer not now.
+    """Raise OutOfMemoryError if a GPU cannot hold `needed` bytes at all, or a computer not now.
 
-    On CUDA the bound is the GPU's memory: the allocator itself refuses what is not free. A computer's allocator grants
-    more than there is, and the system ends the process later.
+    The allocator of a GPU refuses what is not free; a computer's grants more than there is.
     """
     if needed < SMALLEST_CHECKED:
         return

@@ -1,14 +1,19 @@
 """The texture's MLP (paper Sec. 4.1), layer by layer.
 
-Values are (features, points): a column is a point.
+Values are (features, points): a column is a point. A BLAS chooses how it divides a product, and so in which order it
+adds up, by the number of its threads. Here the parts of the columns are fixed, and each is worked on by one thread of
+torch and its BLAS: bits do not depend on how many threads there are.
 """
 
 import functools
-from collections.abc import Sequence
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import torch
 
-from nexwarp.ops.columns import parts_of, share_columns
+from nexwarp.kernels import launch as launching
 
 # Matrix products of half precision want their rows at multiples of 16 bytes: 64 also fills their tiles.
 POINT_MULTIPLE = 64
@@ -43,7 +48,7 @@ def outputs(encoded: torch.Tensor, matrices: Sequence[torch.Tensor], keep: bool)
             if i + 1 < len(matrices):
                 out.relu_()
 
-    share_columns(encoded.shape[1], part)
+    _share_columns(encoded.shape[1], part)
     return layers
 
 
@@ -69,7 +74,7 @@ def outputs_backward(
     count = signal.shape[1]
     result = torch.empty_like(layers[0])
     # A slot for each part, added up in order.
-    slots = [matrix.new_zeros(max(parts_of(count), 1), *matrix.shape) for matrix in matrices]
+    slots = [matrix.new_zeros(max(len(_parts(count)), 1), *matrix.shape) for matrix in matrices]
 
     def part(index: int, columns: slice) -> None:
         here = signal[:, columns]
@@ -81,7 +86,7 @@ def outputs_backward(
             else:
                 here = _relu_backward(matrices[i].T @ here, layer)
 
-    share_columns(count, part)
+    _share_columns(count, part)
     return result, [functools.reduce(torch.Tensor.add_, slot.unbind()) for slot in slots]
 
 
@@ -95,3 +100,59 @@ def _product(signal: torch.Tensor, layer: torch.Tensor) -> torch.Tensor:
     if signal.dtype == torch.float16:
         return torch.mm(signal, layer.T, out_dtype=torch.float32)
     return signal @ layer.T
+
+
+# Columns that one part has at least, and what parts begin at multiples of. Small parts stay in a core's cache from one
+# layer to the next; what they add up does not depend on the number of threads, so their number must not either.
+SMALLEST_PART, ALIGN, MOST_PARTS = 2048, 16, 64
+
+
+def _share_columns(count: int, part: Callable[[int, slice], None]) -> None:
+    """Call `part(index, columns)` for fixed parts of `count` columns, several at a time, without gradients."""
+    # A mode of torch holds in one thread alone.
+    inference = torch.is_inference_mode_enabled()
+
+    def work(numbered: tuple[int, slice]) -> None:
+        with torch.inference_mode(inference), torch.no_grad():
+            part(*numbered)
+
+    for _ in _pool(launching.get_num_threads()).map(work, enumerate(_parts(count))):
+        pass
+
+
+def _parts(count: int) -> list[slice]:
+    return [slice(*bounds) for bounds in launching.chunks(count, ALIGN, SMALLEST_PART, MOST_PARTS)]
+
+
+@functools.lru_cache(maxsize=1)
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads, all of them started, in which torch and its BLAS use one thread each."""
+    started = threading.Barrier(threads + 1)
+
+    def begin() -> None:
+        # Asked first, as a thread that never was takes over the number of the others when it begins to work.
+        torch.get_num_threads()
+        # Holds in the calling thread alone, but is also what threads made later begin with: so it is undone below.
+        torch.set_num_threads(1)
+        started.wait()
+
+    before = torch.get_num_threads()
+    pool = ThreadPoolExecutor(threads, "columns", initializer=begin)
+    for _ in range(threads):
+        pool.submit(int)
+    started.wait()
+    torch.set_num_threads(before)
+    return pool
+
+
+def _after_fork() -> None:
+    """Forget the parent's threads, which do not survive a fork, and let torch do without them.
+
+    OpenMP, which shares out torch's own loops, waits forever in the child of a process that has used it.
+    """
+    _pool.cache_clear()
+    torch.set_num_threads(1)
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

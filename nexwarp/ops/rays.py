@@ -26,13 +26,7 @@ WIDER = 1.0001
 
 @dataclass(frozen=True)
 class RayHits:
-    """What rays hit: the fields of `Hits` but `stops`, and the surface.
-
-    Attributes:
-        plain, base: (H, W, 3), ids, depths, weights: (H, W, K), alpha: (H, W), as in `Hits`; a depth is in units of the
-            ray's vector.
-        surface: depths and normals over all hits.
-    """
+    """What rays hit: the fields of `Hits` but `stops`, depths in units of the ray's vector, and the surface."""
 
     plain: torch.Tensor
     base: torch.Tensor
@@ -45,13 +39,7 @@ class RayHits:
 
 @dataclass(frozen=True)
 class RayTiles:
-    """Lists of the surfels that the rays of each tile may hit, near to far.
-
-    Attributes:
-        surfel_ids: (M,) int32, by tile.
-        tile_offsets: (tiles + 1,) int64, half-open ranges of `surfel_ids`, row by row.
-        columns: tiles in a row.
-    """
+    """(M,) int32 surfels by tile, near to far, (tiles + 1,) int64 ranges of them, row by row, and tiles in a row."""
 
     surfel_ids: torch.Tensor
     tile_offsets: torch.Tensor
@@ -78,9 +66,7 @@ class RayRecords:
 def ray_records(projection: Projection, axes: torch.Tensor | None) -> RayRecords:
     """Return the records of projected surfels for rays through the camera's centre, or for parallel ones.
 
-    Args:
-        projection: the N surfels in the camera's frame.
-        axes: for parallel rays, (N, 2, 3): v1 / s2 and v2 / s1 in the camera frame; None is rays through the centre.
+    For these `axes` (N, 2, 3) are v1 / s2 and v2 / s1 in the camera frame.
     """
     records = projection.records.detach()
     normals = records[:, 2, :3].contiguous()
@@ -98,16 +84,7 @@ def ray_records(projection: Projection, axes: torch.Tensor | None) -> RayRecords
 
 
 def intersect_rays(surfels: RayRecords, keys: torch.Tensor, rays: torch.Tensor) -> RayTiles:
-    """List the surfels of each tile of 16 x 16 rays, by rising key; no surfel that a ray hits is left out.
-
-    Args:
-        surfels: the N surfels.
-        keys: (N,) what sorts surfels near to far; ties by index.
-        rays: (H, W, 3).
-
-    Raises:
-        ValueError, OutOfMemoryError: there are more entries than lists or memory hold.
-    """
+    """List the surfels of each tile of rays (H, W, 3), by rising key (N,), ties by index: all that a ray may hit."""
     height, width = rays.shape[:2]
     side = tile_size_on(rays.is_cuda)
     columns, rows = -(-width // side), -(-height // side)
@@ -145,9 +122,8 @@ def intersect_rays(surfels: RayRecords, keys: torch.Tensor, rays: torch.Tensor) 
 def _bounds(rays: torch.Tensor, side: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Bound the rays of blocks of `side` x `side` pixels, row by row.
 
-    Returns:
-        (B, 3, 3) frames, whose rows are axes; (B, 2) middles and (B, 2) half extents of the rectangle that holds all
-        rays (x, y, 1) in the block's frame; half extents of UNBOUNDED where there is none.
+    Returned are (B, 3, 3) frames, whose rows are axes, and the (B, 2) middles and half extents of the rectangle that
+    holds all rays (x, y, 1) in the block's frame; half extents are UNBOUNDED where there is none.
     """
     height, width = rays.shape[:2]
     columns, rows = -(-width // side), -(-height // side)
@@ -184,16 +160,9 @@ def collect_rays(
     *,
     max_hits: int,
 ) -> RayHits:
-    """Walk every ray's list front to back.
+    """Walk every ray's list front to back; where a ray (H, W, 3) is 0, there is none and nothing is hit.
 
-    Args:
-        surfels: the N surfels.
-        limits: (N,) as in `Projection`.
-        tiles: their lists.
-        rays: (H, W, 3); where it is 0, there is no ray and nothing is hit.
-        near: hits at a depth of at most this are ignored.
-        viewmat: (4, 4) world to camera, which turns the normals into the world.
-        max_hits: K, 0 to 8.
+    `limits` (N,) are those of `Projection`; `viewmat`, world to camera, turns the normals into the world.
     """
     real = real_of(rays)
     t = types(real)

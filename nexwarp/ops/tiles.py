@@ -41,13 +41,7 @@ class UnknownLengthError(RuntimeError):
 
 @dataclass(frozen=True)
 class ListCapacity:
-    """Capacity of tile lists, and what tells whether it suffices; see `fits`.
-
-    Attributes:
-        entries: M, the number of entries that the lists can hold.
-        ends: (N,) int32, as in `Tiles`.
-        kind: (tile columns, tile rows): renderings of one kind need about as many entries.
-    """
+    """What tells whether lists suffice: their length, `ends` and `kind` as in `Tiles`."""
 
     entries: int
     ends: torch.Tensor
@@ -68,7 +62,7 @@ class Tiles:
         columns: tiles in a row.
         exact: whether the lists hold exactly the entries that there are. Otherwise unused places are at the end; or,
             where `ends` counts more than M entries, the lists are incomplete and the walk goes over `order`.
-        kind: as in `ListCapacity`.
+        kind: (tile columns, tile rows): renderings of one kind need about as many entries.
     """
 
     order: torch.Tensor
@@ -116,9 +110,8 @@ def intersect_tiles(
     means = tensors[0]
     real, count = real_of(means), len(means)
     side = tile_size_on(means.is_cuda)
-    columns, rows = -(-camera.width // side), -(-camera.height // side)
+    kind = columns, rows = -(-camera.width // side), -(-camera.height // side)
     order = _depth_order(projection.centers.detach(), blending)
-    kind = (columns, rows)
     polygons, reaches = _tile_polygons(tensors, viewmat, camera, rows)
     arguments = [array(order, wp.int32), polygons, wp.vec2i(columns, rows)]
     threads = list_threads(count, means.is_cuda)
@@ -129,14 +122,26 @@ def intersect_tiles(
     exact = room is None and not learns
     if room is None:
         room = _total(totals, columns * rows) if exact else _room(totals, kind)
+    # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
+    values, tile_ids = ends.new_empty(2 * room), ends.new_empty(2 * room)
+    # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
+    surfel_of = array(ends.new_empty(room) if exact else None, wp.int32)
     emission = [*arguments, array(totals, wp.int64), threads, columns * rows]
-    surfel_ids, entries, tile_ids = _sorted_entries(
-        ends, emit_kernel(real), emission, threads, room, columns * rows, exact
-    )
+    lists = [array(x, wp.int32) for x in (ends, tile_ids[:room], values[:room])]
+    launch(means, emit_kernel(real), threads, emission, [*lists, surfel_of], sharing=UNEVEN)
+    if not threads:
+        values[:room] = 0
+        tile_ids[:room] = columns * rows
+    _sort(tile_ids, values, room, (columns * rows).bit_length())
     if learns:
         _ask(ends, kind)
+    surfel_ids, entries = values[:room], values[:0]
+    if exact:
+        surfel_ids, entries = ends.new_empty(room), values[:room]
+        launch(means, surfel_ids_kernel, room, [array(entries, wp.int32), surfel_of], [array(surfel_ids, wp.int32)])
     offsets = order.new_empty(columns * rows + 1)
-    launch(means, tile_offsets_kernel, len(offsets), [array(tile_ids, wp.int32), room], [array(offsets, wp.int32)])
+    sorted_tiles = array(tile_ids[:room], wp.int32)
+    launch(means, tile_offsets_kernel, len(offsets), [sorted_tiles, room], [array(offsets, wp.int32)])
     return Tiles(order, ends, surfel_ids, entries, offsets, reaches, columns, exact, kind)
 
 
@@ -164,33 +169,6 @@ def _tile_polygons(
     )
     launch(like, tile_polygon_kernel(real), count, arguments, [array(reaches, t.vec2), polygons])
     return polygons, reaches
-
-
-def _sorted_entries(
-    ends: torch.Tensor,
-    emit: wp.Kernel,
-    emission: list[Argument],
-    threads: int,
-    room: int,
-    tiles: int,
-    exact: bool,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Emit `room` entries and sort them by tile; return `Tiles.surfel_ids`, `Tiles.entries` and the sorted tiles."""
-    # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
-    values, tile_ids = ends.new_empty(2 * room), ends.new_empty(2 * room)
-    # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
-    surfels = array(ends.new_empty(room) if exact else None, wp.int32)
-    emitted = [array(tile_ids[:room], wp.int32), array(values[:room], wp.int32), surfels]
-    launch(ends, emit, threads, emission, [array(ends, wp.int32), *emitted], sharing=UNEVEN)
-    if not threads:
-        values[:room] = 0
-        tile_ids[:room] = tiles
-    _sort(tile_ids, values, room, tiles.bit_length())
-    if not exact:
-        return values[:room], values[:0], tile_ids[:room]
-    surfel_ids = ends.new_empty(room)
-    launch(ends, surfel_ids_kernel, room, emitted[1:], [array(surfel_ids, wp.int32)])
-    return surfel_ids, values[:room], tile_ids[:room]
 
 
 def _depth_order(centers: torch.Tensor, blending: Order) -> torch.Tensor:
@@ -232,16 +210,13 @@ def _total(totals: torch.Tensor, tiles: int) -> int:
 
 @dataclass
 class _Need:
-    """Entries that renderings of one kind needed, learnt without waiting: the count arrives in pinned memory later.
+    """Entries that renderings of one kind needed: their count arrives later, in pinned memory, without waiting."""
 
-    `room` is what was given to them, `most` the largest number that is known; `asked` while a count is on its way.
-    """
-
-    room: int
+    room: int  # what was given to them
     total: torch.Tensor
     copied: torch.cuda.Event
-    most: int = 0
-    asked: bool = False
+    most: int = 0  # that is known
+    asked: bool = False  # a count is on its way
 
 
 _needs: dict[tuple[int | None, int, int, int], _Need] = {}
@@ -250,13 +225,9 @@ _needs: dict[tuple[int | None, int, int, int], _Need] = {}
 def _room(totals: torch.Tensor, kind: tuple[int, int]) -> int:
     """Capacity of lists on CUDA: what renderings of this kind needed so far, and half as much again.
 
-    Waits for the GPU only for the first rendering of its kind (device, tile grid, number of surfels within a factor
-    of two). A later one that needs more than there is room for is still right, since the walk then goes over all
-    surfels, but slow; the next one finds more room.
-
-    Args:
-        totals: (N,) integers, the last one is the number of entries of this rendering.
-        kind: as in `ListCapacity`.
+    Waits for the GPU only for the first rendering of its kind (device, tile grid, number of surfels within a factor of
+    two). A later one that needs more is still right, but slow; the next one finds more room. `totals` (N,) are
+    integers, the last one the number of entries of this rendering.
     """
     if len(totals) == 0:
         return 0

@@ -28,25 +28,13 @@ class DistanceField:
     """
 
     def __init__(self, voxel: float, truncation: float, device: torch.device) -> None:
-        """Start without blocks.
-
-        Args:
-            voxel: side of a voxel, world units > 0.
-            truncation: distance to a surface at which the field ends, world units; at most the side of a block.
-            device: of the field.
-        """
+        """Start without blocks; the truncation, where the field ends, is at most the side of a block."""
         self.voxel, self.truncation = voxel, truncation
         self.keys = torch.zeros(0, dtype=torch.int64, device=device)
         self.device = self.keys.device  # with its index
 
     def reserve(self, camera: Camera, depths: torch.Tensor, most: int) -> None:
-        """Note the blocks around a depth image's surfaces; ValueError when there are more than `most`.
-
-        Args:
-            camera: of the image.
-            depths: (H, W) z-depths, world units; 0 where there are none.
-            most: largest number of blocks.
-        """
+        """Note the blocks around a depth image's surfaces (H, W), 0 being none; ValueError when more than `most`."""
         row, column = (depths > 0).nonzero(as_tuple=True)
         z = depths[row, column]
         ray = torch.stack([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy], -1)
@@ -74,13 +62,7 @@ class DistanceField:
         self.means = torch.zeros(count, cells, 4, device=self.device)
 
     def fuse(self, camera: Camera, depths: torch.Tensor, colors: torch.Tensor) -> None:
-        """Take a depth image (H, W) and its colours (H, W, 3) into the field.
-
-        Args:
-            camera: of the image, on the field's device.
-            depths: z-depths, world units; 0 where there are none.
-            colors: in [0, 1].
-        """
+        """Take a depth image (H, W), 0 where there is none, and its colours (H, W, 3) in [0, 1] into the field."""
         shape = (camera.height, camera.width)
         tensors = {"depths": (depths, shape), "colors": (colors, (*shape, 3)), "viewmat": (camera.viewmat, (4, 4))}
         check_tensors(tensors, dtype=torch.float32, device=self.device)

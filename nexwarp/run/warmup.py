@@ -9,7 +9,7 @@ import warp as wp
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
-from nexwarp.ops.startup import start_warp
+from nexwarp.ops import start_warp
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.densify import least_contributing
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
