@@ -133,10 +133,8 @@ def buffered_gradients_function(real: type, max_hits: int) -> wp.Function:
 def reduce_slots_kernel(dtype: type) -> wp.Kernel:
     """Make the kernel of the second half of a backward pass on a CPU: the sums of each surfel's gradient slots.
 
-    A thread is a surfel. Read: `slots` (M, columns), one for each (tile, surfel) entry in the order of emission, in
-    which the entries of the surfel order[rank] lie together and end at ends[rank]. Added to: `sums` (N, columns), in a
-    fixed order. A CPU has no atomics, and a slot has one owner, so this gives the same bits whatever the number of
-    threads.
+    A thread is a surfel. `slots` (M, columns) are in the order of emission, in which the entries of the surfel
+    order[rank] lie together and end at ends[rank]. They are added to `sums` (N, columns) in a fixed order.
     """
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -166,12 +164,7 @@ def collect_backward_kernel(
 ) -> wp.Kernel:
     """Make the backward kernel.
 
-    Args:
-        real: scalar type.
-        max_hits: K.
-        with_errors: also add up weight * error.
-        fixed_point: see `gradient_types`.
-        by_place: give each place of the walk a slot of its own, `slots[k]`, instead of one to each surfel.
+    With `by_place` each place of the walk has a slot of its own, `slots[k]`, instead of one a surfel.
     """
     t = types(real)
     vec4 = t.vec4

@@ -2,7 +2,7 @@
 
 A thread is a pixel. Read: the buffers of `collect`, the textured colours T (P, K) and the background; without `base`, a
 null array, it is 0. Written: image and textured; backward, the gradients of all that is read but the background, where
-an array for them is given. Warp's own adjoint, which serves tapes, adds by atomics to places that only one thread has.
+an array for them is given.
 """
 
 import functools

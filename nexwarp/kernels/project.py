@@ -3,8 +3,7 @@
 A thread is a surfel. Read: means, rotations, scales, opacities, gammas, plain colours and the world-to-camera matrix.
 Written: records, centres and limits; backward, the gradients of every float input, that of the matrix a surfel, from
 those of records. Centres sort and limits cull: both are frozen. The backward kernel writes what `wp.grad` gives for the
-product of outputs and their gradients: Warp's own adjoint, which serves tapes, adds by atomics to rows that only one
-thread has.
+product of outputs and their gradients.
 """
 
 import functools

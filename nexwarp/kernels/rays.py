@@ -13,14 +13,14 @@ tiles. They only cull; nothing is differentiated.
 """
 
 import functools
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from nexwarp.kernels.collect import hit_buffer
 from nexwarp.kernels.shape import reach
 from nexwarp.kernels.surfel import hit_alpha
-from nexwarp.kernels.types import Mat33, Vec2, Vec3, Vec4, types
+from nexwarp.kernels.types import Mat33, Real, Vec2, Vec3, Vec4, types
 from nexwarp.kernels.walk import tile_of
 from nexwarp.native.vector_loads import load_record, record_row
 from nexwarp.native.warp import tile_size
@@ -47,48 +47,30 @@ def beyond(side: Vec3, across: Vec3, middle: Vec2, half: Vec2):
     return above > p.dtype(SLACK) * (wp.length(side) + wp.length(across)) * size
 
 
-@functools.cache
-def bound_functions(real: type) -> SimpleNamespace:
-    """Make the struct of the bounds of blocks of rays, and the function that tests a surfel against one."""
-    t = types(real)
-    vec2, vec3, vec4, mat33 = t.vec2, t.vec3, t.vec4, t.mat33
-
-    @wp.struct
-    class Bounds:
-        """Bounds of the rays of blocks of pixels, see `nexwarp.ops.rays`."""
-
-        frames: wp.array(dtype=mat33)
-        middles: wp.array(dtype=vec2)
-        halves: wp.array(dtype=vec2)
-
-    @wp.func
-    def misses(records: wp.array2d(dtype=vec4), i: int, facing: real, extent: vec2, bounds: Bounds, block: int):
-        """Whether no ray of a block can hit a surfel. Where it can, facing * n . ray > 0."""
-        half = bounds.halves[block]
-        middle = bounds.middles[block]
-        frame = bounds.frames[block]
-        if half[0] > real(LARGE):
-            return False
-        a = turned(frame, records[i, 0])
-        b = turned(frame, records[i, 1])
-        n = turned(frame, records[i, 2]) * facing
-        u = n * extent[0]
-        v = n * extent[1]
-        out = beyond(a, u, middle, half) or beyond(-a, u, middle, half)
-        out = out or beyond(b, v, middle, half) or beyond(-b, v, middle, half)
-        # Behind the rays altogether: n . ray never has the sign of a hit.
-        return out or beyond(-n, vec3(), middle, half)
-
-    return SimpleNamespace(Bounds=Bounds, misses=misses)
+@wp.func
+def misses(records: Any, i: int, facing: Real, extent: Vec2, bounds: Any, block: int):
+    """Whether no ray of a block can hit a surfel. Where it can, facing * n . ray > 0."""
+    half = bounds.halves[block]
+    middle = bounds.middles[block]
+    frame = bounds.frames[block]
+    if half[0] > type(facing)(LARGE):
+        return False
+    a = turned(frame, records[i, 0])
+    b = turned(frame, records[i, 1])
+    n = turned(frame, records[i, 2]) * facing
+    u = n * extent[0]
+    v = n * extent[1]
+    out = beyond(a, u, middle, half) or beyond(-a, u, middle, half)
+    out = out or beyond(b, v, middle, half) or beyond(-b, v, middle, half)
+    # Behind the rays altogether: n . ray never has the sign of a hit.
+    return out or beyond(-n, type(n)(), middle, half)
 
 
 @functools.cache
-def ray_list_kernel(real: type) -> SimpleNamespace:
-    """Make the kernel `lists`, which counts or emits entries, one thread a surfel in depth order, and its struct."""
+def ray_list_kernel(real: type) -> wp.Kernel:
+    """Make the kernel that counts or emits entries, one thread a surfel in depth order."""
     t = types(real)
     vec2, vec4, ZERO = t.vec2, t.vec4, t.ZERO
-    bounds = bound_functions(real)
-    Bounds, misses = bounds.Bounds, bounds.misses
 
     @wp.kernel(enable_backward=False, module="unique")
     def ray_lists(
@@ -96,8 +78,8 @@ def ray_list_kernel(real: type) -> SimpleNamespace:
         order: wp.array(dtype=wp.int32),
         records: wp.array2d(dtype=vec4),
         facings: wp.array(dtype=real),
-        tiles: Bounds,
-        blocks: Bounds,
+        tiles: t.Bounds,
+        blocks: t.Bounds,
         grid: wp.vec2i,
         span: wp.int32,
         ends: wp.array(dtype=wp.int64),
@@ -133,7 +115,7 @@ def ray_list_kernel(real: type) -> SimpleNamespace:
         if not emitting:
             counts[rank] = at - start
 
-    return SimpleNamespace(lists=ray_lists, Bounds=Bounds)
+    return ray_lists
 
 
 @wp.func
@@ -142,81 +124,37 @@ def product(row: Vec4, ray: Vec3):
     return row[0] * ray[0] + row[1] * ray[1] + row[2] * ray[2]
 
 
-@functools.cache
-def ray_functions(real: type) -> SimpleNamespace:
-    """Make the struct of the surfels as rays read them, and the functions of a hit."""
-    t = types(real)
-    vec3, vec4, ZERO, ONE = t.vec3, t.vec4, t.ZERO, t.ONE
+@wp.func
+def ray_hit(surfels: Any, i: int, a: Vec4, b: Vec4, n: Vec4, m: Real, ray: Vec3):
+    """(u, v, t) where a ray meets the surfel's plane."""
+    inverse = type(m)(1.0) / product(n, ray)
+    if surfels.planes:
+        m = wp.dot(surfels.planes[i], ray)
+    return product(a, ray) * inverse, product(b, ray) * inverse, m * inverse
 
-    @wp.struct
-    class RaySurfels:
-        """Surfels as rays read them, see `nexwarp.ops.rays.RayRecords`; without `planes`, t is from the record's m."""
 
-        records: wp.array2d(dtype=vec4)
-        planes: wp.array(dtype=vec3)
-        normals: wp.array(dtype=vec3)
-        limits: wp.array(dtype=real)
-
-    @wp.func
-    def ray_hit(surfels: RaySurfels, i: int, a: vec4, b: vec4, n: vec4, m: real, ray: vec3):
-        """(u, v, t) where a ray meets the surfel's plane."""
-        inverse = ONE / product(n, ray)
-        if surfels.planes:
-            m = wp.dot(surfels.planes[i], ray)
-        return product(a, ray) * inverse, product(b, ray) * inverse, m * inverse
-
-    @wp.func
-    def facing_normal(surfels: RaySurfels, i: int, ray: vec3):
-        """Normal of the side that faces the ray; parallel rays go along z."""
-        n = surfels.normals[i]
-        side = wp.dot(n, ray)
-        if surfels.planes:
-            side = n[2]
-        if side > ZERO:
-            return -n
-        return n
-
-    return SimpleNamespace(Surfels=RaySurfels, hit=ray_hit, normal=facing_normal)
+@wp.func
+def facing_normal(surfels: Any, i: int, ray: Vec3):
+    """Normal of the side that faces the ray; parallel rays go along z."""
+    n = surfels.normals[i]
+    side = wp.dot(n, ray)
+    if surfels.planes:
+        side = n[2]
+    if side > type(side)(0.0):
+        return -n
+    return n
 
 
 @functools.cache
-def insert_function(real: type, max_hits: int) -> wp.Function:
-    """Make the function that inserts a hit into the K-buffer, as `collect` does."""
-    buffer = hit_buffer(real, max_hits)
-    reals, integers = buffer.reals, buffer.integers
-
-    @wp.func
-    def insert(ids: integers, weights: reals, i: wp.int32, weight: real):
-        """Insert a hit before the first lighter one; return (ids, weights, id and weight of the hit that falls out).
-
-        That and all behind it move down by one, so that of equal ones the nearer stays. Out of an empty slot comes the
-        weight 0.
-        """
-        displaced = bool(False)
-        for j in range(wp.static(max_hits)):
-            w_ = weights[j]
-            i_ = ids[j]
-            displaced = displaced or weight > w_
-            weights[j] = wp.where(displaced, weight, w_)
-            ids[j] = wp.where(displaced, i, i_)
-            weight = wp.where(displaced, w_, weight)
-            i = wp.where(displaced, i_, i)
-        return ids, weights, i, weight
-
-    return insert
-
-
-@functools.cache
-def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
-    """Make the collection kernel `collect` and its struct of surfels: a thread is a pixel, and walks its tile's list.
+def collect_rays_kernel(real: type, max_hits: int) -> wp.Kernel:
+    """Make the collection kernel: a thread is a pixel, and walks its tile's list.
 
     Written is what `collect` writes but `stops`, and what `surface` writes, of the same hits in the same way: depths
     are t, and a normal faces the ray.
     """
     t = types(real)
     vec3 = t.vec3
-    buffer, insert = hit_buffer(real, max_hits), insert_function(real, max_hits)
-    r = ray_functions(real)
+    buffer = hit_buffer(real, max_hits)
     ALPHA_MIN, TRANSMITTANCE_MIN, ZERO, HALF, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ZERO, t.HALF, t.ONE
 
     @wp.kernel(
@@ -227,7 +165,7 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
     )
     def collect_rays(
         first: wp.int32,
-        surfels: r.Surfels,
+        surfels: t.RaySurfels,
         surfel_ids: wp.array(dtype=wp.int32),
         tile_offsets: wp.array(dtype=wp.int64),
         rays: wp.array(dtype=vec3),
@@ -262,7 +200,7 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
             i = surfel_ids[k]
             k += wp.int64(1)
             a, b, n, c = load_record(surfels.records, i)
-            u, v, depth = r.hit(surfels, i, a, b, n, c[3], ray)
+            u, v, depth = ray_hit(surfels, i, a, b, n, c[3], ray)
             alpha = hit_alpha(a, b, n, u, v, surfels.limits[i])
             if alpha >= ALPHA_MIN and depth > view.near:
                 weight = alpha * transmittance
@@ -271,11 +209,20 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
                 if weight > heaviest:
                     heaviest = weight
                     top = depth
-                normals += r.normal(surfels, i, ray) * weight
+                normals += facing_normal(surfels, i, ray) * weight
                 total += weight
                 depths += weight * depth
                 transmittance = transmittance * (ONE - alpha)
-                ids, weights, i, weight = insert(ids, weights, i, weight)
+                # Insert it into the buffer and take out the lightest, as `collect` does.
+                displaced = bool(False)
+                for j in range(wp.static(max_hits)):
+                    w_ = weights[j]
+                    i_ = ids[j]
+                    displaced = displaced or weight > w_
+                    weights[j] = wp.where(displaced, weight, w_)
+                    ids[j] = wp.where(displaced, i, i_)
+                    weight = wp.where(displaced, w_, weight)
+                    i = wp.where(displaced, i_, i)
                 c = record_row(surfels.records, wp.max(i, 0), 3)
                 color += vec3(c[0], c[1], c[2]) * weight
                 if transmittance < TRANSMITTANCE_MIN:
@@ -287,7 +234,7 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
             if i >= 0:
                 a, b, n, c = load_record(surfels.records, i)
                 base += vec3(c[0], c[1], c[2]) * weights[j]
-                u, v, depth = r.hit(surfels, i, a, b, n, c[3], ray)
+                u, v, depth = ray_hit(surfels, i, a, b, n, c[3], ray)
             hits.ids[p, j] = i
             hits.depths[p, j] = depth
             hits.weights[p, j] = weights[j]
@@ -299,4 +246,4 @@ def collect_rays_kernel(real: type, max_hits: int) -> SimpleNamespace:
         surface.top[p] = top
         surface.normals[p] = normals
 
-    return SimpleNamespace(collect=collect_rays, Surfels=r.Surfels)
+    return collect_rays

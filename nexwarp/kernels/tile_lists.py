@@ -7,11 +7,11 @@ near ones hundreds. They share the entries of these rows, too, and write them in
 """
 
 import functools
-from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
-from nexwarp.kernels.tiles import LARGEST_INT, span_function
+from nexwarp.kernels.tiles import LARGEST_INT, span
 from nexwarp.kernels.types import types
 from nexwarp.native.warp import from_lane, lane_index, owner_lane, warp_running_sum, warp_size
 
@@ -47,54 +47,46 @@ def list_threads(surfels: int, on_gpu: bool) -> int:
     return -(-surfels // 32) * 32 if on_gpu else surfels
 
 
-@functools.cache
-def row_functions(real: type) -> SimpleNamespace:
-    """Make the functions that share out the tile rows of a warp's surfels among its lanes."""
-    t = types(real)
-    span = span_function(real)
+@wp.func
+def shared_row(
+    place: wp.int32,
+    rows: wp.int32,
+    i: wp.int32,
+    start: wp.int32,
+    tile_columns: wp.int32,
+    polygons: Any,
+):
+    """(surfel, tile row, first tile, number of tiles) of one of the warp's `rows` rows.
 
-    @wp.func
-    def shared_row(
-        place: wp.int32,
-        rows: wp.int32,
-        i: wp.int32,
-        start: wp.int32,
-        tile_columns: wp.int32,
-        polygons: t.Polygons,
-    ):
-        """(surfel, tile row, first tile, number of tiles) of one of the warp's `rows` rows.
+    A lane's surfel is i, and its rows begin at the place `start`.
+    """
+    owner = owner_lane(start, place)
+    surfel = from_lane(i, owner)
+    row = place - from_lane(start, owner)
+    s = wp.vec2i(0, -1)
+    if place < rows:
+        shape = polygons.shapes[surfel]
+        row += shape[1]
+        s = span(surfel, row, tile_columns, shape[0], polygons)
+    return surfel, row, s[0], wp.max(s[1] - s[0] + 1, 0)
 
-        A lane's surfel is i, and its rows begin at the place `start`.
-        """
-        owner = owner_lane(start, place)
-        surfel = from_lane(i, owner)
-        row = place - from_lane(start, owner)
-        s = wp.vec2i(0, -1)
-        if place < rows:
-            shape = polygons.shapes[surfel]
-            row += shape[1]
-            s = span(surfel, row, tile_columns, shape[0], polygons)
-        return surfel, row, s[0], wp.max(s[1] - s[0] + 1, 0)
 
-    @wp.func
-    def rows_of(thread: wp.int32, order: wp.array(dtype=wp.int32), polygons: t.Polygons):
-        """(surfel, its number of tile rows) of a thread."""
-        i = int(0)
-        rows = int(0)
-        if thread < order.shape[0]:
-            i = order[thread]
-            shape = polygons.shapes[i]
-            rows = wp.max(shape[2] - shape[1] + 1, 0)
-        return i, rows
-
-    return SimpleNamespace(shared_row=shared_row, rows_of=rows_of)
+@wp.func
+def rows_of(thread: wp.int32, order: wp.array(dtype=wp.int32), polygons: Any):
+    """(surfel, its number of tile rows) of a thread."""
+    i = int(0)
+    rows = int(0)
+    if thread < order.shape[0]:
+        i = order[thread]
+        shape = polygons.shapes[i]
+        rows = wp.max(shape[2] - shape[1] + 1, 0)
+    return i, rows
 
 
 @functools.cache
 def count_kernel(real: type) -> wp.Kernel:
     """Make the kernel that counts each surfel's entries, a thread a surfel in depth order."""
-    t, functions = types(real), row_functions(real)
-    shared_row, rows_of = functions.shared_row, functions.rows_of
+    t = types(real)
 
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique")
     def count(
@@ -139,8 +131,7 @@ def emit_kernel(real: type) -> wp.Kernel:
     `surfels`, a null array, `entries` gets the surfel. Places of the lists behind the last entry get the tile
     `no_tile`.
     """
-    t, functions = types(real), row_functions(real)
-    shared_row, rows_of = functions.shared_row, functions.rows_of
+    t = types(real)
 
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique")
     def emit(

@@ -1,6 +1,5 @@
-"""Tile lists (paper Sec. 3, after 3DGS): which surfels may be seen in which tile, near to far.
+"""Tile polygons (paper Sec. 3, after 3DGS), of which `tile_lists` makes lists. A thread is a surfel.
 
-Here a surfel's tile polygon and where a tile row cuts it; `tile_lists` makes the lists of them. A thread is a surfel.
 Written is what only culls: nothing here is differentiated.
 
 A surfel's support, the rectangle |u| <= (2 ln 255 o)^(1/(2 g1)), likewise v, is clipped at the near plane and
@@ -10,6 +9,7 @@ decides.
 """
 
 import functools
+from typing import Any
 
 import warp as wp
 
@@ -23,6 +23,7 @@ from nexwarp.native.warp import tile_size
 MARGIN = 0.01
 RELATIVE_MARGIN = 1e-6
 LARGEST = 1e30
+HUGE = wp.constant(wp.float64(LARGEST))
 SHORT_OF_NEAR = wp.constant(wp.float64(0.999))
 # Of a quad that one plane clips.
 MAX_CORNERS = 5
@@ -32,13 +33,7 @@ MAX_ENTRIES = 2**30 - 1
 
 
 def check_entries(total: int, count: int, tiles: int) -> int:
-    """Return the number of (tile, surfel) entries; ValueError when lists cannot be as long.
-
-    Args:
-        total: entries; LARGEST_INT stands for any larger number too.
-        count: surfels, for the message.
-        tiles: of the image, for the message.
-    """
+    """Return the number of (tile, surfel) entries; ValueError when lists cannot be as long."""
     if total > MAX_ENTRIES:
         number = f"{total:,}{' or more' if total >= LARGEST_INT else ''}"
         raise ValueError(
@@ -71,46 +66,37 @@ def near_plane(near: Real, center: Vec3):
     return plane
 
 
-@functools.cache
-def clip_function(real: type) -> wp.Function:
-    """Make the function that clips and projects a support."""
-    t = types(real)
-    vec2, vec3, vec4 = t.vec2, t.vec3, t.vec4
-    mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
-    HUGE = wp.constant(real(LARGEST))
-
-    @wp.func
-    def clip(i: int, quad: mat43, plane: real, intrinsics: vec4, corners: wp.array2d(dtype=vec2)):
-        """Clip a quad at the near plane; return (number of corners, smallest and largest x and y, least depth)."""
-        low = vec2(HUGE, HUGE)
-        high = vec2(-HUGE, -HUGE)
-        nearest = real(HUGE)
-        count = int(0)
-        for k in range(4):
-            j = (k + 1) % 4
-            p = vec3(quad[k, 0], quad[k, 1], quad[k, 2])
-            q = vec3(quad[j, 0], quad[j, 1], quad[j, 2])
-            if p[2] >= plane:
-                x = pixel_of_point(p, intrinsics)
+@wp.func
+def clip(i: int, quad: Any, plane: Real, intrinsics: Vec4, corners: Any):
+    """Clip a quad (4, 3) at the near plane; return (number of corners, least and largest x and y, least depth)."""
+    huge = type(plane)(HUGE)
+    low = wp.vector(huge, huge)
+    high = wp.vector(-huge, -huge)
+    nearest = type(plane)(HUGE)
+    count = int(0)
+    for k in range(4):
+        j = (k + 1) % 4
+        p = wp.vector(quad[k, 0], quad[k, 1], quad[k, 2])
+        q = wp.vector(quad[j, 0], quad[j, 1], quad[j, 2])
+        if p[2] >= plane:
+            x = pixel_of_point(p, intrinsics)
+            corners[i, count] = x
+            count += 1
+            low = wp.min(low, x)
+            high = wp.max(high, x)
+            nearest = wp.min(nearest, p[2])
+        if (p[2] >= plane) != (q[2] >= plane):
+            cut = p + (q - p) * ((plane - p[2]) / (q[2] - p[2]))
+            cut[2] = plane
+            x = pixel_of_point(cut, intrinsics)
+            # Five corners at most; rounding cannot make a sixth of a convex quad.
+            nearest = plane
+            if count < MAX_CORNERS:
                 corners[i, count] = x
                 count += 1
                 low = wp.min(low, x)
                 high = wp.max(high, x)
-                nearest = wp.min(nearest, p[2])
-            if (p[2] >= plane) != (q[2] >= plane):
-                cut = p + (q - p) * ((plane - p[2]) / (q[2] - p[2]))
-                cut[2] = plane
-                x = pixel_of_point(cut, intrinsics)
-                # Five corners at most; rounding cannot make a sixth of a convex quad.
-                nearest = plane
-                if count < MAX_CORNERS:
-                    corners[i, count] = x
-                    count += 1
-                    low = wp.min(low, x)
-                    high = wp.max(high, x)
-        return count, low, high, nearest
-
-    return clip
+    return count, low, high, nearest
 
 
 @functools.cache
@@ -121,7 +107,6 @@ def tile_polygon_kernel(real: type) -> wp.Kernel:
     mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
     ZERO, HALF, ONE = t.ZERO, t.HALF, t.ONE
     HUGE = wp.constant(real(LARGEST))
-    clip = clip_function(real)
     RELATIVE = wp.constant(real(RELATIVE_MARGIN))
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -187,45 +172,38 @@ def tile_polygon_kernel(real: type) -> wp.Kernel:
     return tile_polygon
 
 
-@functools.cache
-def span_function(real: type) -> wp.Function:
-    """Make the function that cuts a tile polygon with the slab of a tile row."""
-    t = types(real)
-    HALF, ONE = t.HALF, t.ONE
-    HUGE = wp.constant(real(LARGEST))
-
-    @wp.func
-    def span(i: int, row: int, tile_columns: int, count: int, polygons: t.Polygons):
-        """First and last tile of a tile row that the tile polygon touches; first > last when none."""
-        side = real(float(tile_size()))
-        margin = polygons.margins[i]
-        top = real(float(row)) * side + HALF - margin
-        bottom = real(float(row + 1)) * side - HALF + margin
-        low = real(HUGE)
-        high = real(-HUGE)
-        if count > 0:
-            p = load_pair(polygons.corners, i, count - 1)
-            for k in range(count):
-                q = load_pair(polygons.corners, i, k)
-                if q[1] >= top and q[1] <= bottom:
-                    low = wp.min(low, q[0])
-                    high = wp.max(high, q[0])
-                if (p[1] < top) != (q[1] < top):
-                    x = p[0] + (q[0] - p[0]) * ((top - p[1]) / (q[1] - p[1]))
-                    low = wp.min(low, x)
-                    high = wp.max(high, x)
-                if (p[1] > bottom) != (q[1] > bottom):
-                    x = p[0] + (q[0] - p[0]) * ((bottom - p[1]) / (q[1] - p[1]))
-                    low = wp.min(low, x)
-                    high = wp.max(high, x)
-                p = q
-        if not (low <= high):
-            return wp.vec2i(0, -1)
-        left = (low - margin + HALF) / side - ONE
-        x0 = tile_index(left, tile_columns)
-        if left > real(float(x0)):
-            x0 += 1
-        x1 = tile_index((high + margin - HALF) / side, tile_columns)
-        return wp.vec2i(wp.max(x0, 0), wp.min(x1, tile_columns - 1))
-
-    return span
+@wp.func
+def span(i: int, row: int, tile_columns: int, count: int, polygons: Any):
+    """First and last tile of a tile row that the tile polygon touches; first > last when none."""
+    margin = polygons.margins[i]
+    side = type(margin)(float(tile_size()))
+    half = type(margin)(0.5)
+    one = type(margin)(1.0)
+    top = type(margin)(float(row)) * side + half - margin
+    bottom = type(margin)(float(row + 1)) * side - half + margin
+    low = type(margin)(HUGE)
+    high = -type(margin)(HUGE)
+    if count > 0:
+        p = load_pair(polygons.corners, i, count - 1)
+        for k in range(count):
+            q = load_pair(polygons.corners, i, k)
+            if q[1] >= top and q[1] <= bottom:
+                low = wp.min(low, q[0])
+                high = wp.max(high, q[0])
+            if (p[1] < top) != (q[1] < top):
+                x = p[0] + (q[0] - p[0]) * ((top - p[1]) / (q[1] - p[1]))
+                low = wp.min(low, x)
+                high = wp.max(high, x)
+            if (p[1] > bottom) != (q[1] > bottom):
+                x = p[0] + (q[0] - p[0]) * ((bottom - p[1]) / (q[1] - p[1]))
+                low = wp.min(low, x)
+                high = wp.max(high, x)
+            p = q
+    if not (low <= high):
+        return wp.vec2i(0, -1)
+    left = (low - margin + half) / side - one
+    x0 = tile_index(left, tile_columns)
+    if left > type(margin)(float(x0)):
+        x0 += 1
+    x1 = tile_index((high + margin - half) / side, tile_columns)
+    return wp.vec2i(wp.max(x0, 0), wp.min(x1, tile_columns - 1))

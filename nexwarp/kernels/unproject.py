@@ -2,8 +2,7 @@
 
 A thread is a pixel. Read: depths (P, K) and the world-to-camera matrix. Written: for a hit at z-depth t the point
 origin + t * R^T d, and for a pixel the direction R^T d, unit, for the textured colour's SH; backward, the gradients of
-depths and, a pixel, of the matrix. Warp's own adjoint, which serves tapes, adds by atomics to places that only one
-thread has.
+depths and, a pixel, of the matrix.
 """
 
 import functools

@@ -21,43 +21,36 @@ def tile_size_on(on_gpu: bool) -> int:
 @wp.func_native(snippet(f"return {TILE_SIZE};", f"return {CPU_TILE_SIZE};"))
 def tile_size() -> wp.int32:
     """Return the number of pixels along a tile's side."""
-    ...
 
 
 @wp.func_native(snippet("return __any_sync(0xffffffffu, x);", "return x;"))
 def any_in_warp(x: wp.int32) -> wp.int32:
     """Return nonzero in all lanes when x is nonzero in any."""
-    ...
 
 
 @wp.func_native(snippet("return threadIdx.x & 31;", "return 0;"))
 def lane_index() -> wp.int32:
     """Return the index of this lane, 0 to 31."""
-    ...
 
 
 @wp.func_native(snippet("return 32;", "return 1;"))
 def warp_size() -> wp.int32:
     """Return the number of threads of a warp."""
-    ...
 
 
 @wp.func_native(snippet("return (int)__ballot_sync(0xffffffffu, x);", "return x != 0;"))
 def ballot(x: wp.int32) -> wp.int32:
     """Return, as bits, the lanes in which x is nonzero."""
-    ...
 
 
 @wp.func_native(snippet("return __ffs(mask) - 1;", "return 0;"))
 def lowest_lane(mask: wp.int32) -> wp.int32:
     """Return the lowest lane of a ballot that is not empty."""
-    ...
 
 
 @wp.func_native(snippet("return __shfl_sync(0xffffffffu, x, source);", "return x;"))
 def from_lane(x: wp.int32, source: wp.int32) -> wp.int32:
     """Return the value that x has in the lane `source`."""
-    ...
 
 
 _RUNNING_SUM = """
@@ -72,7 +65,6 @@ _RUNNING_SUM = """
 @wp.func_native(snippet(_RUNNING_SUM) + "return x;")
 def warp_running_sum(x: wp.int32) -> wp.int32:
     """Return the sum of x over this lane and those below it."""
-    ...
 
 
 _OWNER = """
@@ -84,25 +76,21 @@ _OWNER = """
 @wp.func_native("int owner = 0;\n" + snippet(_OWNER) + "return owner;")
 def owner_lane(start: wp.int32, place: wp.int32) -> wp.int32:
     """Return the highest lane whose `start` is at most `place`, where starts do not decrease and lane 0 has 0."""
-    ...
 
 
 @wp.func_native(snippet("return __popc(mask);", "return mask != 0;"))
 def population(mask: wp.int32) -> wp.int32:
     """Return the number of lanes in a ballot."""
-    ...
 
 
 @wp.func_native(snippet("return __popc(mask & ((1u << (threadIdx.x & 31)) - 1u));", "return 0;"))
 def lanes_below(mask: wp.int32) -> wp.int32:
     """Return the number of lanes in a ballot that are lower than this one."""
-    ...
 
 
 @wp.func_native(snippet("__syncwarp();"))
 def sync_warp():
     """Wait for all lanes of the warp, and make what they have written to shared memory visible to each other."""
-    ...
 
 
 _MAX = "for (int o = 16; o > 0; o >>= 1) x = max(x, __shfl_xor_sync(0xffffffffu, x, o));"
@@ -111,7 +99,6 @@ _MAX = "for (int o = 16; o > 0; o >>= 1) x = max(x, __shfl_xor_sync(0xffffffffu,
 @wp.func_native(snippet(_MAX) + "return x;")
 def warp_max(x: wp.int32) -> wp.int32:
     """Return the largest x of all lanes."""
-    ...
 
 
 _SUM = "for (int o = 16; o > 0; o >>= 1) x += __shfl_down_sync(0xffffffffu, x, o);"

@@ -93,27 +93,27 @@ def intersect_rays(surfels: RayRecords, keys: torch.Tensor, rays: torch.Tensor) 
     order = torch.sort(keys.float(), stable=True).indices.int()
     count, device = len(order), rays.device
     counts = torch.zeros(count, dtype=torch.int64, device=device)
-    kernels = ray_list_kernel(real)
+    kernel = ray_list_kernel(real)
     bounds = (
-        dict(zip(kernels.Bounds.vars, map(array, _bounds(rays, side), (t.mat33, t.vec2, t.vec2)), strict=True))
+        dict(zip(t.Bounds.vars, map(array, _bounds(rays, side), (t.mat33, t.vec2, t.vec2)), strict=True))
         for side in (side, side * SPAN)
     )
     inputs = [
         array(order, wp.int32),
         array(surfels.records.contiguous(), t.vec4),
         array(surfels.facings, real),
-        *(struct(kernels.Bounds, **fields) for fields in bounds),
+        *(struct(t.Bounds, **fields) for fields in bounds),
         wp.vec2i(columns, rows),
         SPAN,
     ]
-    launch(rays, kernels.lists, count, [*inputs, None], [array(counts, wp.int64), None, None])
+    launch(rays, kernel, count, [*inputs, None], [array(counts, wp.int64), None, None])
     ends = counts.cumsum(0)
     total = check_entries(int(ends[-1]), count, columns * rows) if count else 0
     check_memory(BYTES_AN_ENTRY * total, device, f"a list of {total:,} (tile, surfel) entries")
     tiles, ids = (torch.zeros(total, dtype=torch.int32, device=device) for _ in range(2))
     outputs = [array(counts, wp.int64), array(tiles, wp.int32), array(ids, wp.int32)]
     if total:
-        launch(rays, kernels.lists, count, [*inputs, array(ends, wp.int64)], outputs)
+        launch(rays, kernel, count, [*inputs, array(ends, wp.int64)], outputs)
     tiles, sorting = torch.sort(tiles, stable=True)
     every = torch.arange(columns * rows + 1, dtype=torch.int32, device=device)
     return RayTiles(ids[sorting].contiguous(), torch.searchsorted(tiles, every).contiguous(), columns)
@@ -172,9 +172,8 @@ def collect_rays(
     alpha, expected, median, top = (rays.new_zeros(height, width) for _ in range(4))
     ids = torch.full((height, width, max_hits), -1, dtype=torch.int32, device=rays.device)
     depths, weights = (rays.new_zeros(height, width, max_hits) for _ in range(2))
-    kernels = collect_rays_kernel(real, max_hits)
     records = struct(
-        kernels.Surfels,
+        t.RaySurfels,
         records=array(surfels.records.contiguous(), t.vec4),
         planes=array(surfels.planes, t.vec3),
         normals=array(surfels.normals, t.vec3),
@@ -189,6 +188,6 @@ def collect_rays(
         hits_argument(real, (plain, base, ids, depths, weights, alpha, None)),
         surface_argument(real, (expected, median, top, normals)),
     ]
-    launch_pixels(rays, kernels.collect, len(tiles.tile_offsets) - 1, arguments)
+    launch_pixels(rays, collect_rays_kernel(real, max_hits), len(tiles.tile_offsets) - 1, arguments)
     normals = torch.nn.functional.normalize(normals @ viewmat[:3, :3].to(normals), dim=-1)
     return RayHits(plain, base, ids, depths, weights, alpha, Surface(expected, median, top, normals))

@@ -9,6 +9,7 @@ import nexwarp as nw
 from nexwarp.model import render as module
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
+from nexwarp.native.warp import tile_size_on
 from nexwarp.ops.rays import RayTiles
 from nexwarp.run.evaluate import psnr
 from tests import scenes
@@ -44,7 +45,8 @@ def test_a_pinhole_given_as_rays_is_the_pinhole(device, seed, max_hits):
 def everywhere(surfels, keys, rays):
     """Lists that cull nothing."""
     order = torch.sort(keys.float(), stable=True).indices.int()
-    columns, rows = -(-rays.shape[1] // 16), -(-rays.shape[0] // 16)
+    side = tile_size_on(rays.is_cuda)
+    columns, rows = -(-rays.shape[1] // side), -(-rays.shape[0] // side)
     offsets = torch.arange(columns * rows + 1, device=rays.device) * len(order)
     return RayTiles(order.repeat(columns * rows), offsets, columns)
 

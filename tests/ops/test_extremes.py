@@ -8,6 +8,7 @@ import torch
 import nexwarp as nw
 from nexwarp import ops
 from nexwarp.kernels.tiles import LARGEST_INT, MAX_ENTRIES
+from nexwarp.native.warp import tile_size_on
 from tests.narrowing import present
 from tests.scenes import SURFEL_KEYS, Scene, detached_shape, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close, assert_finite
@@ -185,7 +186,7 @@ def test_five_million_surfels() -> None:
 
 
 def too_many(device: torch.device, count: int) -> tuple[nw.Surfels, nw.Camera]:
-    """Surfels that cover all 512 x 512 tiles of an image."""
+    """Surfels that cover all tiles of an image."""
     scene = large_scene(count, device)
     scene |= {"scales": torch.full_like(scene["scales"], 1e8), "opacities": torch.full_like(scene["opacities"], 0.9)}
     return make_surfels(scene), make_camera(scene)
@@ -195,8 +196,8 @@ def too_many(device: torch.device, count: int) -> tuple[nw.Surfels, nw.Camera]:
 def test_more_entries_than_lists_can_have_are_refused(count: int, device: torch.device) -> None:
     """2^30 and more, 2^31 and more, which int32 takes for negative, 2^32 and more, for positive again."""
     surfels, camera = too_many(device, count)
-    tiles, entries = (SIDE // 16) ** 2, count * (SIDE // 16) ** 2
-    assert entries > MAX_ENTRIES
+    tiles = (SIDE // tile_size_on(device.type == "cuda")) ** 2
+    assert count * tiles > MAX_ENTRIES
     with pytest.raises(ValueError, match=REFUSED) as caught:
         nw.render(surfels, None, camera, max_hits=0)
     for text in (f"of {count:,} surfels and {tiles:,} tiles", "render fewer"):
