@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from benchmarks.timing import ROOT, Measurement, measure
+from benchmarks.timing import ROOT, Measurement, Repeats, measure
 from nexwarp.model.model_file import MODEL_FILE
 
 
@@ -38,8 +38,8 @@ class Options:
 
     def time(self, name: str, run: Callable[[], Any], **facts: Any) -> Measurement:
         """Call `timing.measure` on this device, with few repeats when quick."""
-        brief = {"seconds": 0.0, "warmup": 1, "least": 2} if self.quick else {}
-        return measure(name, run, self.device, **(facts | brief))
+        repeats = Repeats(seconds=0.0, warmup=1, least=2) if self.quick else Repeats()
+        return measure(name, run, self.device, repeats=repeats, **facts)
 
 
 Stage = Callable[[Options], list[Measurement]]

@@ -72,6 +72,23 @@ class Measurement:
         return json.dumps(dataclasses.asdict(self))
 
 
+@dataclass(frozen=True)
+class Repeats:
+    """How often a function is timed.
+
+    Attributes:
+        seconds: stop repeating after this long.
+        warmup: untimed runs; the first one compiles.
+        least: timed runs at least, however long they take.
+        most: timed runs at most.
+    """
+
+    seconds: float = 2.0
+    warmup: int = 3
+    least: int = 5
+    most: int = 100
+
+
 def measure(
     name: str,
     run: Callable[[], Any],
@@ -80,10 +97,7 @@ def measure(
     scene: str = "",
     sizes: dict[str, Any] | None = None,
     note: str = "",
-    seconds: float = 2.0,
-    warmup: int = 3,
-    least: int = 5,
-    most: int = 100,
+    repeats: Repeats = Repeats(),
 ) -> Measurement:
     """Time a function after warming it up.
 
@@ -96,19 +110,16 @@ def measure(
         scene: of the measurement.
         sizes: of the measurement.
         note: of the measurement.
-        seconds: stop repeating after this long.
-        warmup: untimed runs; the first one compiles.
-        least: timed runs at least, however long they take.
-        most: timed runs at most.
+        repeats: how often it is timed.
     """
-    for _ in range(warmup):
+    for _ in range(repeats.warmup):
         run()
     clock = _cuda_clock if device.type == "cuda" else _wall_clock
     synchronize(device)
     reset_peak(device)
     start = time.perf_counter()
     times: list[float] = []
-    while len(times) < least or (len(times) < most and time.perf_counter() - start < seconds):
+    while len(times) < repeats.least or (len(times) < repeats.most and time.perf_counter() - start < repeats.seconds):
         times.append(clock(run))
     return figure(name, times, device, scene=scene, sizes=sizes, note=note, peak_mib=peak(device))
 

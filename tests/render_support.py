@@ -56,13 +56,21 @@ def view_of(camera: nw.Camera, order: str = "depth") -> View:
 
 
 def reference_render(
-    surfels: nw.Surfels, texture: nw.NeuralTexture | None, camera: nw.Camera, *, order: str = "depth", **options: Any
+    surfels: nw.Surfels,
+    texture: nw.NeuralTexture | None,
+    camera: nw.Camera,
+    *,
+    order: str = "depth",
+    clamp_texture: bool = False,
+    shares: torch.Tensor | None = None,
+    **options: Any,
 ) -> reference.Rendering:
     """Hand the public objects, in float64 on the CPU, to the reference."""
     field = None
     if texture is not None:
         mlp = list(texture.mlp.parameters())
-        field = reference.Texture(texture.grid, texture.resolutions.double(), mlp, texture.residual)
+        resolutions = texture.resolutions.double()
+        field = reference.Texture(texture.grid, resolutions, mlp, texture.residual, clamp_texture, shares)
     shape = Shape(surfels.means, surfels.quats, surfels.scales, surfels.opacities, surfels.gammas)
     return reference.render(shape, surfels.sh, field, camera.viewmat, view_of(camera, order), **options)
 

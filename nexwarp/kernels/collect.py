@@ -15,6 +15,7 @@ Frozen there: the lists, which hits count, which are in the buffer, where the wa
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -45,6 +46,20 @@ def hit_buffer(real: type, max_hits: int) -> SimpleNamespace:
     return SimpleNamespace(reals=reals, integers=integers, empty=empty)
 
 
+@wp.func
+def alpha_if_near(u: Any, v: Any, limit: Any, opacity: Any, g1: Any, g2: Any):
+    """`alpha_at`, on a CPU 0 far outside; on a GPU some lane nearly always needs the exponentials."""
+    alpha = type(u)(0.0)
+    if warp_size() > 1 or not far_outside(u, v, limit):
+        alpha = alpha_at(u, v, opacity, g1, g2)
+    return alpha
+
+
+def _launch_bounds(real: type, max_hits: int) -> int | tuple[int, int]:
+    """Where registers are few, as many blocks at once as 64 registers allow."""
+    return (BLOCK_DIM, 8) if real is wp.float32 and max_hits <= 2 else BLOCK_DIM
+
+
 @functools.cache
 def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
     """Make the forward kernel."""
@@ -58,8 +73,7 @@ def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
         grid_stride=False,
         module="unique",
         module_options={"fast_math": real is wp.float32},
-        # As many blocks at once as 64 registers allow.
-        launch_bounds=(BLOCK_DIM, 8) if real is wp.float32 and max_hits <= 2 else BLOCK_DIM,
+        launch_bounds=_launch_bounds(real, max_hits),
     )
     def collect(first: wp.int32, surfels: t.Surfels, lists: TileLists, view: t.View, hits: t.Hits):
         thread = first + wp.tid()
@@ -84,10 +98,7 @@ def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
                 i = name[0]
                 a, b, n, c = staged_record(slot, surfels.records, i)
                 u, v, depth = hit(a, b, n, c[3], d)
-                # On a GPU some lane nearly always needs the exponentials.
-                alpha = real(0.0)
-                if width > 1 or not far_outside(u, v, surfels.limits[i]):
-                    alpha = alpha_at(u, v, a[3], b[3], n[3])
+                alpha = alpha_if_near(u, v, surfels.limits[i], a[3], b[3], n[3])
                 if alpha >= ALPHA_MIN and depth > view.near and transmittance >= TRANSMITTANCE_MIN:
                     weight = alpha * transmittance
                     transmittance = transmittance * (ONE - alpha)

@@ -20,7 +20,7 @@ def compose_kernels(real: type) -> SimpleNamespace:
     vec3, ONE = t.vec3, t.ONE
 
     @wp.kernel(enable_backward=False, module="unique")
-    def compose(
+    def compose(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         plain: wp.array(dtype=vec3),
         base: wp.array(dtype=vec3),
@@ -42,7 +42,7 @@ def compose_kernels(real: type) -> SimpleNamespace:
         image[p] = plain[p] + total + background[0] * (ONE - alphas[p])
 
     @wp.kernel(enable_backward=False, module="unique")
-    def compose_backward(
+    def compose_backward(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         colors: wp.array2d(dtype=vec3),
         weights: wp.array2d(dtype=real),

@@ -54,7 +54,7 @@ def project_kernels(real: type) -> SimpleNamespace:
     vec2, vec3, vec4, mat44 = t.vec2, t.vec3, t.vec4, t.mat44
 
     @wp.kernel(enable_backward=False, module="unique")
-    def project(
+    def project(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         means: wp.array(dtype=vec3),
         quats: wp.array(dtype=vec4),
@@ -79,7 +79,7 @@ def project_kernels(real: type) -> SimpleNamespace:
         limits[i] = exponent_limit(opacities[i])
 
     @wp.kernel(enable_backward=False, module="unique")
-    def project_backward(
+    def project_backward(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         means: wp.array(dtype=vec3),
         quats: wp.array(dtype=vec4),

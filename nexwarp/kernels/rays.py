@@ -73,7 +73,7 @@ def ray_list_kernel(real: type) -> wp.Kernel:
     vec2, vec4, ZERO = t.vec2, t.vec4, t.ZERO
 
     @wp.kernel(enable_backward=False, module="unique")
-    def ray_lists(
+    def ray_lists(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         order: wp.array(dtype=wp.int32),
         records: wp.array2d(dtype=vec4),

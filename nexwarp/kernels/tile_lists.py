@@ -134,7 +134,7 @@ def emit_kernel(real: type) -> wp.Kernel:
     t = types(real)
 
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique")
-    def emit(
+    def emit(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         order: wp.array(dtype=wp.int32),
         polygons: t.Polygons,

@@ -110,7 +110,7 @@ def tile_polygon_kernel(real: type) -> wp.Kernel:
     RELATIVE = wp.constant(real(RELATIVE_MARGIN))
 
     @wp.kernel(enable_backward=False, module="unique")
-    def tile_polygon(
+    def tile_polygon(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         means: wp.array(dtype=vec3),
         quats: wp.array(dtype=vec4),

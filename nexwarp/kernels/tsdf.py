@@ -28,7 +28,7 @@ def fuse_kernel() -> wp.Kernel:
     cells = BLOCK_SIDE * BLOCK_SIDE * BLOCK_SIDE
 
     @wp.kernel(enable_backward=False, module="unique")
-    def fuse(
+    def fuse(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         blocks: wp.array(dtype=wp.vec3i),
         voxel: wp.float32,

@@ -59,7 +59,7 @@ def unproject_kernels(real: type) -> SimpleNamespace:
             positions[p, h] = origin + ray * depths[p, h]
 
     @wp.kernel(enable_backward=False, module="unique")
-    def unproject_backward(
+    def unproject_backward(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         depths: wp.array2d(dtype=real),
         viewmats: wp.array(dtype=mat44),

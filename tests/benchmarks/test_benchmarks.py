@@ -13,7 +13,7 @@ from benchmarks import bench_frame, bench_peers
 from benchmarks.gpu_time import busy
 from benchmarks.scenes import SurfelScene, cloud, fox, garden, geometry, texture, workload
 from benchmarks.suite import Options, table
-from benchmarks.timing import Measurement, measure
+from benchmarks.timing import Measurement, Repeats, measure
 from nexwarp import NeuralTexture
 from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.model.detail_limits import NEVER
@@ -35,7 +35,7 @@ def test_timer_finds_the_median_of_a_known_sleep() -> None:
         calls.append(None)
         time.sleep(0.2 if len(calls) == 1 else 0.02)
 
-    m = measure("nap", nap, CPU, warmup=1, least=5, most=5, sizes={"surfels": 1})
+    m = measure("nap", nap, CPU, repeats=Repeats(warmup=1, least=5, most=5), sizes={"surfels": 1})
     assert len(calls) == 6 and m.repeats == 5
     assert 20 <= m.median < 60  # the slow first call is warm-up; a shared machine may oversleep
     assert m.p10 <= m.median <= m.p90
@@ -176,7 +176,9 @@ def test_peer_gets_the_same_scene() -> None:
 
     class Peer:
         @staticmethod
-        def rasterization_2dgs(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane):
+        def rasterization_2dgs(  # noqa: PLR0913  # as gsplat's
+            means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane
+        ):
             seen.update({k: tuple(v.shape) for k, v in locals().items() if isinstance(v, torch.Tensor)})
             assert (width, height) == (43, 30) and near_plane > 0
             return means.sum().expand(1, height, width, 3), opacities.sum().expand(1, height, width, 1), None

@@ -32,12 +32,16 @@ class Texture:
         resolutions: (L,), cells per world unit.
         mlp: weight matrices (out, in), first layer first, ReLU between them.
         residual: colours are added to the plain ones.
+        clamp: colours are limited to >= 0.
+        shares: (H, W, K), a constant: depth at which each hit is looked up, over the hit's own.
     """
 
     grid: torch.Tensor
     resolutions: torch.Tensor
     mlp: Sequence[torch.Tensor]
     residual: bool = False
+    clamp: bool = False
+    shares: torch.Tensor | None = None
 
 
 def field(texture: Texture, positions: torch.Tensor, depths: torch.Tensor, focal: float) -> torch.Tensor:
@@ -58,13 +62,8 @@ def render(
     max_hits: int = 2,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     sh_degree: int = 3,
-    clamp_texture: bool = False,
-    shares: torch.Tensor | None = None,
 ) -> Rendering:
-    """Render; differentiable with respect to every float tensor, those of `texture` included.
-
-    `shares` (H, W, K), a constant: depth at which each hit's texture is looked up, over the hit's own.
-    """
+    """Render; differentiable with respect to every float tensor, those of `texture` included."""
     means, (height, width) = shape.means, (view.height, view.width)
     rotation = viewmat[:3, :3]
     position = -rotation.T @ viewmat[:3, 3]
@@ -78,12 +77,12 @@ def render(
     else:
         rays = (rays_of(view, means) @ rotation).reshape(height, width, 1, 3).expand(-1, -1, max_hits, -1)[filled]
         depths = hits.depths[filled]
-        looked_up = depths if shares is None else depths * shares[filled]
+        looked_up = depths if texture.shares is None else depths * texture.shares[filled]
         coefficients = field(texture, position + looked_up[:, None] * rays, depths, (view.fx * view.fy) ** 0.5)
         directions = rays / rays.norm(dim=-1, keepdim=True)
         values = evaluate(coefficients, directions, sh_degree)
         values = values + (colors[hits.ids[filled]] if texture.residual else 0.5)
-        texels = texels.index_put((filled,), values.clamp_min(0) if clamp_texture else values)
+        texels = texels.index_put((filled,), values.clamp_min(0) if texture.clamp else values)
 
     textured = (hits.weights[..., None] * texels).sum(dim=-2)
     behind = (1 - hits.alpha)[..., None] * torch.as_tensor(background, dtype=means.dtype, device=means.device)
