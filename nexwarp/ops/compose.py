@@ -1,5 +1,7 @@
 """Composition of the passes into one image."""
 
+import math
+
 import torch
 from torch.autograd.function import once_differentiable
 
@@ -36,20 +38,15 @@ def compose(
 
 def _arrays(real: type, tensors: list[torch.Tensor | None]) -> list[Argument]:
     vec3 = types(real).vec3
-    plain, base, colors, weights, alpha, background = tensors
+    # The last dimensions of a pixel's values; the background is one row.
+    hits = next((x.shape[2] for x in (tensors[3], tensors[2]) if x is not None), 0)
+    shapes = ((3,), (3,), (hits, 3), (hits,), (), (3,))
+    dtypes = (vec3, vec3, vec3, real, real, vec3)
 
-    def flat(x: torch.Tensor | None, *shape: int) -> torch.Tensor | None:
-        return None if x is None else x.reshape(-1, *shape) if x.numel() else x.view(x.shape[0] * x.shape[1], *shape)
+    def flat(x: torch.Tensor | None, shape: tuple[int, ...]) -> torch.Tensor | None:
+        return None if x is None else x.view(math.prod(x.shape[: x.dim() - len(shape)]), *shape)
 
-    hits = next((x.shape[2] for x in (weights, colors) if x is not None), 0)
-    return [
-        array(flat(plain, 3), vec3),
-        array(flat(base, 3), vec3),
-        array(flat(colors, hits, 3), vec3),
-        array(flat(weights, hits), real),
-        array(flat(alpha), real),
-        array(None if background is None else background[None], vec3),
-    ]
+    return [array(flat(x, shape), dtype) for x, shape, dtype in zip(tensors, shapes, dtypes, strict=True)]
 
 
 class _Compose(torch.autograd.Function):
