@@ -53,7 +53,7 @@ class Fused:
     packed: Word
     offset: wp.float32
     clamp: wp.int32
-    # Written by the forward pass; empty are `encoded` without a backward pass, and in it `colors` without a clamp.
+    # Written by the forward pass; `encoded` is empty without a backward pass.
     encoded: Word
     colors: Vec3
     # The backward pass: gradients in half precision are multiplied by `scale`.
@@ -149,7 +149,7 @@ def fused_kernels(features: int) -> SimpleNamespace:
     def forward(thread: wp.int32, threads: wp.int32, fused: Fused): ...
 
     @wp.func_native(snippet(FIELDS + backward_text(features)))
-    def backward(thread: wp.int32, threads: wp.int32, fused: Fused): ...
+    def backward(thread: wp.int32, threads: wp.int32, fused: Fused, clamped: Vec3): ...
 
     @wp.kernel(
         enable_backward=False, grid_stride=False, module="unique", launch_bounds=(FORWARD_THREADS, FORWARD_BLOCKS)
@@ -160,7 +160,8 @@ def fused_kernels(features: int) -> SimpleNamespace:
     @wp.kernel(
         enable_backward=False, grid_stride=False, module="unique", launch_bounds=(BACKWARD_THREADS, BACKWARD_BLOCKS)
     )
-    def fused_backward(first: wp.int32, threads: wp.int32, fused: Fused):
-        backward(first + wp.tid(), threads, fused)
+    def fused_backward(first: wp.int32, threads: wp.int32, fused: Fused, clamped: Vec3):
+        # Colours that were clamped, else empty; apart from the struct, where it would cost registers.
+        backward(first + wp.tid(), threads, fused, clamped)
 
     return SimpleNamespace(forward=fused_forward, backward=fused_backward)

@@ -288,8 +288,8 @@ _BACKWARD = """
                     #pragma unroll
                     for (int c = 0; c < 3; ++c) {
                         grad[c] = reinterpret_cast<const float*>(grad_colors.data)[3 * point + c] * scaled;
-                        if (colors.shape[0] == 0) continue;
-                        const float color = reinterpret_cast<const float*>(colors.data)[3 * point + c];
+                        if (clamped.shape[0] == 0) continue;
+                        const float color = reinterpret_cast<const float*>(clamped.data)[3 * point + c];
                         if (!(color > 0.0f)) grad[c] = 0.0f;
                     }
                 }

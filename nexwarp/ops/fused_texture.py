@@ -123,7 +123,7 @@ class _Colors(torch.autograd.Function):
             ("grad_encoded", grad_encoded, wp.int32),
         ):
             fused[name] = array(tensor, dtype)
-        grad_matrices = _mlp_backward(fused, weights, table, unscale, units)
+        grad_matrices = _mlp_backward(fused, weights, table, unscale)
         grad_grid, grad_points = _scatter(fused, points, table, units, need_positions or need_depths)
         return (
             *(None,) * 4,
@@ -176,18 +176,15 @@ def forward(points: Points, field: Field, rays: Rays, keep: bool) -> tuple[torch
 
 
 def _mlp_backward(
-    fused: dict[str, Argument],
-    weights: Sequence[torch.Tensor],
-    table: torch.Tensor,
-    unscale: torch.Tensor,
-    units: int,
+    fused: dict[str, Argument], weights: Sequence[torch.Tensor], table: torch.Tensor, unscale: torch.Tensor
 ) -> list[torch.Tensor]:
     """Write the gradients of the features, scaled, and return those of the matrices."""
     features, blocks = table.shape[2], BACKWARD_BLOCKS * _multiprocessors(table)
     slots = unscale.new_empty(blocks, sum(GRADIENTS))
     arguments = struct(Fused, **fused, grad_matrices=array(slots.view(-1), wp.float32))
     threads = BACKWARD_THREADS * blocks
-    launch(table, fused_kernels(features).backward, threads, [threads, arguments], [], block_dim=BACKWARD_THREADS)
+    kernel = fused_kernels(features).backward
+    launch(table, kernel, threads, [threads, arguments, fused["colors"]], [], block_dim=BACKWARD_THREADS)
     order = _order(features, len(weights[-1]), table.device)
     flat = unscale.new_empty(len(order))
     inputs = [array(slots.sum(0), wp.float32), array(order, wp.int32), array(unscale, wp.float32)]
