@@ -52,7 +52,7 @@ class Train:
     """Run folder to write."""
     max_surfels: Annotated[int | None, option("P", "400000; demo 3000")] = None
     """Largest number of surfels."""
-    iterations: Annotated[int | None, option("N", "30000; demo 1200")] = None
+    iterations: Annotated[int | None, option("N", "30000; demo 700")] = None
     """Views to train on."""
     max_hits: Annotated[int | None, option("K", "2")] = None
     """K, textured hits of a pixel, 0 to 8."""

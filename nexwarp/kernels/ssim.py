@@ -13,6 +13,7 @@ either side, down the rows; the result goes to shared memory, from where a threa
 along a row; and what comes of that goes through shared memory again, so that neighbouring threads write neighbours.
 """
 
+import functools
 import math
 
 import warp as wp
@@ -158,136 +159,148 @@ def ssim(mx: wp.float32, my: wp.float32, q: wp.float32, p: wp.float32):
     return wp.vec4(s, (b - a) * inverse * my + (s / d - s / c) * mx, -s / d, a * inverse)
 
 
-@wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
-def score(
-    first: wp.int32,
-    image: wp.array(dtype=wp.float32),
-    target: wp.array(dtype=wp.float32),
-    height: wp.int32,
-    width: wp.int32,
-    scale: wp.float32,
-    # outputs
-    losses: wp.array(dtype=wp.float32),
-    derivatives: wp.array2d(dtype=wp.float32),
-):
-    """Sums of (1 - s) scale, one a thread, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
-    thread = first + wp.tid()
-    at = place(thread, width)
-    lane = at[0]
-    column = at[1] - 3 * REACH + lane
-    mx = Rows()
-    my = Rows()
-    q = Rows()
-    p = Rows()
-    if column >= 0 and column < width:
-        for i in range(wp.static(ROWS + 2 * REACH)):
-            row = at[2] + i - REACH
-            x = float(0.0)
-            y = float(0.0)
-            if row >= 0 and row < height:
-                x = image[row * width + column]
-                y = target[row * width + column]
-            xy = x * y
-            square = 0.5 * (x * x + y * y)
-            for j in range(wp.static(ROWS)):
-                if wp.static(tap(i - j) > 0.0):
-                    mx[j] += x * wp.static(wp.float32(tap(i - j)))
-                    my[j] += y * wp.static(wp.float32(tap(i - j)))
-                    q[j] += square * wp.static(wp.float32(tap(i - j)))
-                    p[j] += xy * wp.static(wp.float32(tap(i - j)))
-    put(0, lane, mx)
-    put(1, lane, my)
-    put(2, lane, q)
-    put(3, lane, p)
-    sync_block()
-    total = float(0.0)
-    ds_dmx = Group()
-    ds_dq = Group()
-    ds_dp = Group()
-    if lane < COLUMNS:
-        gx = blur(0, lane)
-        gy = blur(1, lane)
-        gq = blur(2, lane)
-        gp = blur(3, lane)
-        row = at[2] + lane // wp.static(COLUMNS // GROUP)
-        for o in range(wp.static(GROUP)):
-            s = ssim(gx[o], gy[o], gq[o], gp[o])
-            ds_dmx[o] = s[1]
-            ds_dq[o] = s[2]
-            ds_dp[o] = s[3]
-            if row < height and at[1] + group_column(lane) + 3 * o < width:
-                total += (1.0 - s[0]) * scale
-    losses[thread] = total
-    if not derivatives:
-        return
-    sync_block()
-    if lane < COLUMNS:
-        put_group(0, lane, ds_dmx)
-        put_group(1, lane, ds_dq)
-        put_group(2, lane, ds_dp)
-    sync_block()
-    write_columns(derivatives, lane, at[1] + lane, at[2], height, width)
+@functools.cache
+def score_kernel() -> wp.Kernel:
+    """Make the kernel of the scores; decorating it hashes unrolled code, which takes half a second."""
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
+    def score(
+        first: wp.int32,
+        image: wp.array(dtype=wp.float32),
+        target: wp.array(dtype=wp.float32),
+        height: wp.int32,
+        width: wp.int32,
+        scale: wp.float32,
+        # outputs
+        losses: wp.array(dtype=wp.float32),
+        derivatives: wp.array2d(dtype=wp.float32),
+    ):
+        """Sums of (1 - s) scale, one a thread, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
+        thread = first + wp.tid()
+        at = place(thread, width)
+        lane = at[0]
+        column = at[1] - 3 * REACH + lane
+        mx = Rows()
+        my = Rows()
+        q = Rows()
+        p = Rows()
+        if column >= 0 and column < width:
+            for i in range(wp.static(ROWS + 2 * REACH)):
+                row = at[2] + i - REACH
+                x = float(0.0)
+                y = float(0.0)
+                if row >= 0 and row < height:
+                    x = image[row * width + column]
+                    y = target[row * width + column]
+                xy = x * y
+                square = 0.5 * (x * x + y * y)
+                for j in range(wp.static(ROWS)):
+                    if wp.static(tap(i - j) > 0.0):
+                        mx[j] += x * wp.static(wp.float32(tap(i - j)))
+                        my[j] += y * wp.static(wp.float32(tap(i - j)))
+                        q[j] += square * wp.static(wp.float32(tap(i - j)))
+                        p[j] += xy * wp.static(wp.float32(tap(i - j)))
+        put(0, lane, mx)
+        put(1, lane, my)
+        put(2, lane, q)
+        put(3, lane, p)
+        sync_block()
+        total = float(0.0)
+        ds_dmx = Group()
+        ds_dq = Group()
+        ds_dp = Group()
+        if lane < COLUMNS:
+            gx = blur(0, lane)
+            gy = blur(1, lane)
+            gq = blur(2, lane)
+            gp = blur(3, lane)
+            row = at[2] + lane // wp.static(COLUMNS // GROUP)
+            for o in range(wp.static(GROUP)):
+                s = ssim(gx[o], gy[o], gq[o], gp[o])
+                ds_dmx[o] = s[1]
+                ds_dq[o] = s[2]
+                ds_dp[o] = s[3]
+                if row < height and at[1] + group_column(lane) + 3 * o < width:
+                    total += (1.0 - s[0]) * scale
+        losses[thread] = total
+        if not derivatives:
+            return
+        sync_block()
+        if lane < COLUMNS:
+            put_group(0, lane, ds_dmx)
+            put_group(1, lane, ds_dq)
+            put_group(2, lane, ds_dp)
+        sync_block()
+        write_columns(derivatives, lane, at[1] + lane, at[2], height, width)
+
+    return score
 
 
-@wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
-def gradient(  # noqa: PLR0913  # a kernel entry point
-    first: wp.int32,
-    derivatives: wp.array2d(dtype=wp.float32),
-    image: wp.array(dtype=wp.float32),
-    target: wp.array(dtype=wp.float32),
-    height: wp.int32,
-    width: wp.int32,
-    scale: wp.float32,
-    grad_loss: wp.array(dtype=wp.float32),
-    # outputs
-    grad_image: wp.array(dtype=wp.float32),
-):
-    at = place(first + wp.tid(), width)
-    lane = at[0]
-    column = at[1] - 3 * REACH + lane
-    dmx = Rows()
-    dq = Rows()
-    dp = Rows()
-    if column >= 0 and column < width:
-        for i in range(wp.static(ROWS + 2 * REACH)):
-            row = at[2] + i - REACH
-            x = float(0.0)
-            y = float(0.0)
-            z = float(0.0)
-            if row >= 0 and row < height:
-                x = derivatives[0, row * width + column]
-                y = derivatives[1, row * width + column]
-                z = derivatives[2, row * width + column]
+@functools.cache
+def gradient_kernel() -> wp.Kernel:
+    """Make the kernel of the gradient."""
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
+    def gradient(  # noqa: PLR0913  # a kernel entry point
+        first: wp.int32,
+        derivatives: wp.array2d(dtype=wp.float32),
+        image: wp.array(dtype=wp.float32),
+        target: wp.array(dtype=wp.float32),
+        height: wp.int32,
+        width: wp.int32,
+        scale: wp.float32,
+        grad_loss: wp.array(dtype=wp.float32),
+        # outputs
+        grad_image: wp.array(dtype=wp.float32),
+    ):
+        at = place(first + wp.tid(), width)
+        lane = at[0]
+        column = at[1] - 3 * REACH + lane
+        dmx = Rows()
+        dq = Rows()
+        dp = Rows()
+        if column >= 0 and column < width:
+            for i in range(wp.static(ROWS + 2 * REACH)):
+                row = at[2] + i - REACH
+                x = float(0.0)
+                y = float(0.0)
+                z = float(0.0)
+                if row >= 0 and row < height:
+                    x = derivatives[0, row * width + column]
+                    y = derivatives[1, row * width + column]
+                    z = derivatives[2, row * width + column]
+                for j in range(wp.static(ROWS)):
+                    if wp.static(tap(i - j) > 0.0):
+                        dmx[j] += x * wp.static(wp.float32(tap(i - j)))
+                        dq[j] += y * wp.static(wp.float32(tap(i - j)))
+                        dp[j] += z * wp.static(wp.float32(tap(i - j)))
+        put(0, lane, dmx)
+        put(1, lane, dq)
+        put(2, lane, dp)
+        sync_block()
+        gmx = Group()
+        gq = Group()
+        gp = Group()
+        if lane < COLUMNS:
+            gmx = blur(0, lane)
+            gq = blur(1, lane)
+            gp = blur(2, lane)
+        sync_block()
+        if lane < COLUMNS:
+            put_group(0, lane, gmx)
+            put_group(1, lane, gq)
+            put_group(2, lane, gp)
+        sync_block()
+        column = at[1] + lane
+        if lane < COLUMNS and column < width:
+            factor = -scale * grad_loss[0]
             for j in range(wp.static(ROWS)):
-                if wp.static(tap(i - j) > 0.0):
-                    dmx[j] += x * wp.static(wp.float32(tap(i - j)))
-                    dq[j] += y * wp.static(wp.float32(tap(i - j)))
-                    dp[j] += z * wp.static(wp.float32(tap(i - j)))
-    put(0, lane, dmx)
-    put(1, lane, dq)
-    put(2, lane, dp)
-    sync_block()
-    gmx = Group()
-    gq = Group()
-    gp = Group()
-    if lane < COLUMNS:
-        gmx = blur(0, lane)
-        gq = blur(1, lane)
-        gp = blur(2, lane)
-    sync_block()
-    if lane < COLUMNS:
-        put_group(0, lane, gmx)
-        put_group(1, lane, gq)
-        put_group(2, lane, gp)
-    sync_block()
-    column = at[1] + lane
-    if lane < COLUMNS and column < width:
-        factor = -scale * grad_loss[0]
-        for j in range(wp.static(ROWS)):
-            row = at[2] + j
-            if row < height:
-                k = row * width + column
-                cells = j * THREADS + lane
-                change = cell(False, cells, 0.0) + cell(False, cells + wp.static(ROWS * THREADS), 0.0) * image[k]
-                change += cell(False, cells + wp.static(2 * ROWS * THREADS), 0.0) * target[k]
-                grad_image[k] = change * factor
+                row = at[2] + j
+                if row < height:
+                    k = row * width + column
+                    cells = j * THREADS + lane
+                    change = cell(False, cells, 0.0) + cell(False, cells + wp.static(ROWS * THREADS), 0.0) * image[k]
+                    change += cell(False, cells + wp.static(2 * ROWS * THREADS), 0.0) * target[k]
+                    grad_image[k] = change * factor
+
+    return gradient

@@ -5,7 +5,7 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.ssim import C1, C2, REACH, THREADS, WINDOW_SIZE, blocks_of, gradient, score, tap
+from nexwarp.kernels.ssim import C1, C2, REACH, THREADS, WINDOW_SIZE, blocks_of, gradient_kernel, score_kernel, tap
 from nexwarp.ops._interop import Context, array, launch, real_of
 
 
@@ -71,7 +71,7 @@ class _KernelDSSIM(torch.autograd.Function):
         losses = image.new_empty(threads)
         inputs = [*(array(x.view(-1), wp.float32) for x in (image, target)), height, width, ctx.scale]
         outputs = [array(losses, wp.float32), array(derivatives, wp.float32)]
-        launch(image, score, threads, inputs, outputs, block_dim=THREADS)
+        launch(image, score_kernel(), threads, inputs, outputs, block_dim=THREADS)
         return losses.sum()
 
     @staticmethod
@@ -83,5 +83,5 @@ class _KernelDSSIM(torch.autograd.Function):
         inputs = [array(derivatives, wp.float32), *(array(x.view(-1), wp.float32) for x in (image, target))]
         inputs += [height, width, ctx.scale, array(grad_loss.reshape(1), wp.float32)]
         outputs = [array(grad_image.view(-1), wp.float32)]
-        launch(image, gradient, THREADS * blocks_of(height, width), inputs, outputs, block_dim=THREADS)
+        launch(image, gradient_kernel(), THREADS * blocks_of(height, width), inputs, outputs, block_dim=THREADS)
         return grad_image, None, None

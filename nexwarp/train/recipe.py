@@ -289,7 +289,7 @@ PAPER = Config(
 
 # What the demo changes in any preset: it is small enough for two CPU cores, a short run, so its steps are larger.
 DEMO_SETTINGS: dict[str, object] = {
-    "iterations": 1200,
+    "iterations": 700,
     "max_surfels": 3000,
     "depth_jitter": 0.5,
     "texture.levels": 12,

@@ -1,6 +1,7 @@
 """What a training step compares its rendering with."""
 
 import dataclasses
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -69,7 +70,9 @@ class TargetSource:
 
     def __init__(self, state: TrainingState, calibration: ExposureCalibration | None) -> None:
         """Move the photos, of one exposure where `calibration` is None, to the device."""
-        self.state, self.scene, self.config, self.poses = state, state.scene, state.config, state.poses
+        # The state holds this source: a cycle would keep the memory of both until the garbage collector comes.
+        self.state: TrainingState = weakref.proxy(state)
+        self.scene, self.config, self.poses = state.scene, state.config, state.poses
         gains, lens = (None, None) if calibration is None else (calibration.gains, calibration.exposures)
         self.views = TrainingViews(self.scene.train, state.device, gains, lens)
         self.background = self.config.background or self.scene.background or mean_color(self.scene.train, calibration)

@@ -21,7 +21,7 @@ OLD = Path(__file__).parents[1] / "old_files"
 SCENE = OLD / "scene"
 RUNS = sorted(path.name for path in OLD.iterdir() if (path / "config.json").is_file())
 # An hour's development version: its exposures lack what today's predict from.
-UNREADABLE = {"0.1-d-9cd22ab": "expected the tensor exposures.coefficients, found none"}
+UNREADABLE = {"0.1-d-9cd22ab": "exposures: expected coefficients, found none"}
 # Only the version that wrote a checkpoint is promised to read it; these are refused.
 NOT_RESUMED = {
     "0.1-a-ef9e8f4": "expected a whole checkpoint, but it cannot be read (expected format version 1, got None)",

@@ -243,7 +243,7 @@ def test_the_demo_keeps_what_makes_a_preset():
     """Its own settings are those of a short run on a CPU; the paper's texture stays the paper's."""
     train = Train(SceneSource("demo"), preset="paper")
     config, paper = train._config(), preset("paper")
-    assert (config.preset, config.iterations, config.texture.levels) == ("paper", 1200, 12)
+    assert (config.preset, config.iterations, config.texture.levels) == ("paper", 700, 12)
     for name in ("texture.residual", "texture.max_resolution", "losses.depth", "densify.prune_at_cap", "smooth_sh"):
         assert setting(config, name) == setting(paper, name)
     assert dataclasses.replace(train, preset="default")._config().texture.residual

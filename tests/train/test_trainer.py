@@ -1,8 +1,10 @@
 """Training: the laws of the loop and its schedules, and what it learns from real photos."""
 
 import dataclasses
+import gc
 import itertools
 import math
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,19 @@ def scene(tiny_scene: Scene) -> Scene:
 
 def mean_psnr(trainer: Trainer, views: list[View]) -> float:
     return evaluate(trainer.model(), views)["psnr"]
+
+
+def test_a_trainer_is_freed_with_its_last_reference(scene):
+    """A cycle would keep a teacher's memory until the garbage collector comes, while the next one trains."""
+    trainer = Trainer(scene, small(), "cpu")
+    trainer.step()
+    left = weakref.ref(trainer)
+    gc.disable()
+    try:
+        del trainer
+        assert left() is None
+    finally:
+        gc.enable()
 
 
 # Repeatability
