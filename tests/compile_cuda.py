@@ -25,14 +25,14 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "storage": (wp.float16,),
     "dtype": (wp.float32, types(wp.float32).vec3, types(wp.float32).vec4),
     "max_hits": (0, 1, 2, MAX_HITS),
-    "degree": range(4),
+    "degree": (0, 1, 2, 3),
     "features": (1, 2, 4, 8),
     "clamp": (False, True),
     "with_errors": (False, True),
     "fixed_point": (False, True),
     "by_place": (False,),  # True is for CPUs
 }
-ALL = VALUES | {"max_hits": range(MAX_HITS + 1)}
+ALL = VALUES | {"max_hits": tuple(range(MAX_HITS + 1))}
 FUSED = VALUES | {"features": (2, 4)}
 # Their atomics depend on the architecture.
 ATOMIC = ("hashgrid", "fused_scatter")

@@ -114,7 +114,7 @@ def failing(disk: Disk) -> Iterator[Disk]:
         yield disk
 
 
-SYSTEM_CALLS = [(Path, name) for name in ("write_bytes", "rename", "mkdir", "touch", "rmdir")]
+SYSTEM_CALLS: list[tuple[object, str]] = [(Path, name) for name in ("write_bytes", "rename", "mkdir", "touch", "rmdir")]
 SYSTEM_CALLS += [(os, name) for name in ("fsync", "replace")]
 
 

@@ -45,7 +45,7 @@ def write_demo(folder: str | Path, width: int, height: int, views: int, points: 
     every = sorted(whole.reg_image_ids(), key=lambda number: whole.image(number).name)
     chosen = [every[int(index)] for index in np.linspace(0, len(every), views, endpoint=False)]
     keypoints: dict[int, list[np.ndarray]] = {number: [] for number in chosen}
-    kept = []
+    kept: list[tuple[Any, Any]] = []  # points and their tracks
     for _, point in sorted(whole.points3D.items()):
         seen = [element for element in point.track.elements if element.image_id in keypoints]
         if len(seen) >= 2 and len(kept) < points:

@@ -13,7 +13,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.options import RenderChanges
 
 FORMAT = 2
-PASSES = ("image", "plain", "textured", "alpha", "ids", "depths", "weights", "colors")
+PASSES: tuple[str, ...] = ("image", "plain", "textured", "alpha", "ids", "depths", "weights", "colors")
 PASSES += ("expected_depth", "median_depth", "top_depth", "normals")
 SLOTS = ("ids", "depths", "weights", "colors")
 

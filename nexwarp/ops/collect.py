@@ -79,7 +79,8 @@ def collect(projection: Projection, tiles: Tiles, camera: Pinhole, *, max_hits: 
         raise ValueError(f"max_hits: expected 0 to {MAX_HITS}, got {max_hits}")
     request = SplatErrorRequest()
     scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera)
-    return Hits(*_Collect.apply(projection.records, scene, max_hits, request), request)
+    plain, base, ids, depths, weights, alpha, stops = _Collect.apply(projection.records, scene, max_hits, request)
+    return Hits(plain, base, ids, depths, weights, alpha, stops, request)
 
 
 def splat_error(
@@ -99,8 +100,8 @@ def splat_error(
     """
     check_tensors({"errors": (errors, (camera.height, camera.width))}, device=projection.records.device)
     scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera)
-    outputs = (hits.plain, hits.base, hits.ids, hits.depths, hits.weights, hits.alpha, hits.stops)
-    outputs = tuple(x.detach() for x in outputs)
+    buffers = (hits.plain, hits.base, hits.ids, hits.depths, hits.weights, hits.alpha, hits.stops)
+    outputs = tuple(x.detach() for x in buffers)
     plain, base, _ids, depths, weights, alpha, _stops = (torch.zeros_like(x) for x in outputs)
     errors = errors.detach().to(scene.records.dtype).contiguous()
     _, sums = _backward(scene, outputs, (plain, base, depths, weights, alpha), errors)
@@ -125,7 +126,7 @@ class Walked(NamedTuple):
         """The structs `Surfels`, `TileLists` and `View` of the kernels."""
         t, tiles, camera = types(self.real), self.tiles, self.camera
         records, limits, reaches = array(self.records, t.vec4), array(self.limits, t.real), array(tiles.reaches, t.vec2)
-        lists = {name: array(getattr(tiles, name), wp.int32) for name in TileLists.vars}
+        lists = {name: array(getattr(tiles, name), wp.int32) for name in TileLists.vars}  # type: ignore[attr-defined]  # of a Warp struct
         return [
             struct(t.Surfels, records=records, limits=limits, reaches=reaches),
             struct(TileLists, **lists),
@@ -267,7 +268,8 @@ def _backward(
 def hits_argument(real: type, outputs: tuple[torch.Tensor | None, ...]) -> Argument:
     """The struct `Hits` of the kernels, of (plain, base, ids, depths, weights, alphas, stops)."""
     t = types(real)
-    plain, base, ids, depths, weights, alphas, stops = outputs
+    *buffers, stops = outputs
+    plain, base, ids, depths, weights, alphas = (x for x in buffers if x is not None)
     return struct(
         t.Hits,
         plain=array(plain.view(-1, 3), t.vec3),

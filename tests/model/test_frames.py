@@ -449,7 +449,7 @@ def test_memory_of_graphs_is_given_back_when_it_is_missing(monkeypatch: pytest.M
     """A frame that does not fit is rendered again without the graphs."""
     held = graphs(model)
     camera = cameras("cuda", 1, width=64, height=32)[0]
-    original, calls = frames.draw, []
+    original, calls = draw, []
 
     def scarce(*arguments: Any, **options: Any) -> Rendering:
         calls.append(len(held.frames))

@@ -97,8 +97,8 @@ def test_a_file_of_version_0_1_renders_as_before(tmp_path: Path, stored: tuple[s
     nearest = limits[0] if "footprints" in stored else torch.zeros(24)
     farthest = limits[1] if "far_footprints" in stored else torch.full((24,), NEVER)
     limits_read = DetailLimits(nearest, farthest) if stored else None
-    parts = {"exposures": loaded.exposures, "limits": limits_read}
-    expected = draw(loaded.surfels, loaded.texture, camera, loaded.options, **parts)
+    drawn = (loaded.surfels, loaded.texture, camera, loaded.options)
+    expected = draw(*drawn, exposures=loaded.exposures, limits=limits_read)
     assert torch.equal(loaded.render(camera).image, expected.image)
     assert (loaded.detail_limits is None) == (not stored)
 

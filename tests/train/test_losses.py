@@ -36,8 +36,9 @@ def test_dssim_of_constant_images_by_hand() -> None:
     """Away from the border two constant images differ in luminance only: (2 a b + C1) / (a^2 + b^2 + C1)."""
     a, b, size = 0.3, 0.7, 400
 
-    def constants(size: int) -> list[torch.Tensor]:
-        return [torch.full((size, size, 3), value, dtype=torch.float64) for value in (a, b)]
+    def constants(size: int) -> tuple[torch.Tensor, torch.Tensor]:
+        full = torch.ones((size, size, 3), dtype=torch.float64)
+        return a * full, b * full
 
     expected = 1 - (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
     assert dssim(*constants(size)).item() == pytest.approx(expected, abs=20 / size)

@@ -122,7 +122,7 @@ def test_a_path_is_played_and_kept_as_its_views_say(model, tmp_path, monkeypatch
             expected = session.cameras[name]
             torch.testing.assert_close(camera.viewmat, expected.viewmat, atol=1e-4, rtol=0)
             torch.testing.assert_close(camera.K, expected.K, atol=1e-3, rtol=0)
-        editor.seconds.value = 0.1
+        editor.seconds.value = 0.1  # type: ignore[misc]
         asyncio.run(editor.play())
         last = viewer.world.to_scene(np.asarray(session.client.camera.position))
         np.testing.assert_allclose(last, camera_to_world(session.cameras["train/1.png"])[:3, 3], atol=1e-4)

@@ -134,6 +134,6 @@ def test_settings_take_what_can_be_meant():
     for name, value, clamped in (("max_hits", 99, 8), ("sh_degree", -5, 0), ("slot", 0, 1)):
         assert getattr(Settings().changed(name, value), name) == clamped
     wrong = [("mode", "rm -rf"), ("max_hits", "2"), ("max_hits", 2.5), ("slot", True), ("as_trained", 1)]
-    for name, value in wrong:
+    for name, value in wrong:  # type: ignore[assignment]
         with pytest.raises(ValueError, match=name):
             Settings().changed(name, value)

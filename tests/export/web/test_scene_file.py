@@ -47,6 +47,7 @@ def test_a_quantised_file_holds_the_surfels_in_morton_order():
     for name in ("scales", "gammas"):  # the axes may be swapped
         values, wanted = (np.sort(x, axis=1) for x in (surfels[name], getattr(expected, name)[order]))
         np.testing.assert_allclose(values, wanted, rtol=0.01, err_msg=name)
+    assert expected.limits is not None
     np.testing.assert_allclose(surfels["limits"], expected.limits[order], rtol=1e-3)
 
 
