@@ -34,7 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--weight", type=float, default=0.5)
-    parser.add_argument("--downscale", type=int, default=4, help="reduce the demo's photos of 192x144 by this factor")
+    parser.add_argument("--downscale", type=int, default=4, help="reduce the demo's photos of 96x72 by this factor")
     parser.add_argument("--optimizer", choices=("adam", "radam"), default="adam")
     args = parser.parse_args()
     demo = nw.load_scene(demo_folder(), downscale=args.downscale)

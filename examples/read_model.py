@@ -1,6 +1,6 @@
 """Draw one pixel of a trained scene with NumPy alone: the format of model files (docs/format.md), as a program.
 
-python examples/read_model.py --run runs/demo --column 96 --row 72
+python examples/read_model.py --run runs/demo --column 48 --row 36
 """
 
 import argparse
@@ -209,8 +209,8 @@ def main() -> None:
     """Print the colour of a pixel of the first test view."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, default=Path("runs/demo"), help="run folder")
-    parser.add_argument("--column", type=int, default=96)
-    parser.add_argument("--row", type=int, default=72)
+    parser.add_argument("--column", type=int, default=48)
+    parser.add_argument("--row", type=int, default=36)
     options = parser.parse_args()
     name, camera = next(iter(json.loads((options.run / "cameras.json").read_text())["test"].items()))
     tensors, meta = read(options.run / "model.safetensors")

@@ -36,7 +36,7 @@ def main() -> None:
     """Train, and tell how the PSNR grows."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--downscale", type=int, default=2, help="reduce the demo's photos of 192x144 by this factor")
+    parser.add_argument("--downscale", type=int, default=2, help="reduce the demo's photos of 96x72 by this factor")
     parser.add_argument("--out", default="runs/from_tensors")
     args = parser.parse_args()
     scene = scene_in_memory(args.downscale)
