@@ -18,6 +18,7 @@ from nexwarp.cli.session import Session
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.run.folder import RunRecord, create_run, list_files, read_run
+from nexwarp.train import trainer as trainer_module
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import TextureConfig
@@ -336,7 +337,7 @@ def test_memory_that_a_teacher_lacks_is_told_as_its_own(
     def fail(*_: object, **__: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. And more")
 
-    monkeypatch.setattr("nexwarp.model.model.render", fail)
+    monkeypatch.setattr(trainer_module, "draw", fail)
     if api:
         with pytest.raises(OutOfMemoryError) as caught:
             nw.train(tiny_scene, CONFIG, device=CPU)
