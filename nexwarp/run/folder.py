@@ -79,7 +79,7 @@ def _any(names: Iterable[str]) -> str:
     return f"(?:{'|'.join(map(re.escape, names))})"
 
 
-# All files that nexwarp writes, for --overwrite.
+# The files that nexwarp writes, for --overwrite; `_view_pictures` has those named after views.
 OURS = re.compile(
     "|".join(
         [
@@ -88,7 +88,6 @@ OURS = re.compile(
             rf"(?:{_any(CHECKPOINTS)}|{_ASIDE})/{_any(CHECKPOINT_FILES)}",
             rf"{TENSORBOARD_FOLDER}/events\.out\.tfevents\.[^/]*",
             rf"{EXPORT_FOLDER}/{_any(name for names in EXPORTS.values() for name in names)}",
-            rf"{RENDERS_FOLDER}/(?:{_any(PROJECTIONS)}/)?{_any((TRAIN, TEST, COMPARE))}/.+\.(?:png|exr)",
             rf"{RENDERS_FOLDER}/(?:{_any(PROJECTIONS)}/)?(?:{_any(PATHS)}|path_[^/]+)/\d{{4,}}\.(?:png|exr)",
         ]
     )
@@ -336,6 +335,22 @@ def teacher_folders(run: Path) -> list[Path]:
     return [folder for folder in folders if folder.is_dir() and not (folder.is_symlink() or folder.parent.is_symlink())]
 
 
+def _view_pictures(run: Path) -> set[str]:
+    """Return the names that renderings of the run's views have, as far as the run tells its views."""
+    views: set[str] = set()
+    for file, take in ((CAMERAS_FILE, lambda data: data.values()), (METRICS_FILE, lambda data: [data["views"]])):
+        with suppress(*READ_ERRORS):  # there is none yet, or it is damaged
+            views.update(str(name) for group in take(read_json(run / file)) for name in group)
+    pictures = [Path(picture_name(view)) for view in views if Path(view).name]
+    groups = (TRAIN, TEST, COMPARE, *(f"{kind}/{group}" for kind in PROJECTIONS for group in (TRAIN, TEST)))
+    return {
+        f"{RENDERS_FOLDER}/{group}/{picture.with_suffix(suffix).as_posix()}"
+        for group in groups
+        for picture in pictures
+        for suffix in (".png", ".exr")
+    }
+
+
 def list_files(run: Path) -> tuple[list[str], list[str]]:
     """Return the files below a run folder that have names of ours, and what else there is; links are not followed.
 
@@ -343,6 +358,7 @@ def list_files(run: Path) -> tuple[list[str], list[str]]:
     """
     own: list[str] = []
     foreign: list[str] = []
+    pictures = set().union(*(_view_pictures(folder) for folder in (run, *teacher_folders(run))))
     teachers = [f"{folder.relative_to(run).as_posix()}/" for folder in teacher_folders(run)]
 
     def in_run(name: str) -> str:
@@ -357,7 +373,8 @@ def list_files(run: Path) -> tuple[list[str], list[str]]:
                 foreign.append(name if (run / name).is_symlink() else f"{name}/")
                 folders.remove(Path(name).name)
         for name in names:
-            ours = is_temporary(name) or OURS.fullmatch(in_run(prefix + name))
+            inner = in_run(prefix + name)
+            ours = is_temporary(name) or inner in pictures or OURS.fullmatch(inner)
             (own if ours else foreign).append(prefix + name)
     return sorted(own), sorted(foreign)
 
@@ -366,7 +383,9 @@ def delete_files(run: Path, keep: Iterable[str] = ()) -> list[str]:
     """Delete the files of a run but those to keep, and the folders that this leaves empty; return what is not ours."""
     own, foreign = list_files(run)
     folders = {each / name for each in (run, *teacher_folders(run)) for name in FOLDERS}
-    for name in own:
+    # The files of a run folder itself go last: until then they tell which pictures are ours.
+    runs = [run, *teacher_folders(run)]
+    for name in sorted(own, key=lambda name: (run / name).parent in runs):
         if name not in keep:
             (run / name).unlink()
             folders |= {run / parent for parent in Path(name).parents[:-1]}

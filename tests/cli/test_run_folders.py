@@ -185,3 +185,12 @@ def test_bad_input_does_not_overwrite(finished, tmp_path, capsys):
     before = snapshot(finished)
     refused(capsys, ["train", str(tmp_path / "no"), "--run", str(finished), *FLAGS, "--overwrite"], "no such folder")
     assert snapshot(finished) == before
+
+
+def test_pictures_that_are_named_after_no_view_are_not_ours(tmp_path):
+    (tmp_path / "renders/test").mkdir(parents=True)
+    (tmp_path / "cameras.json").write_text('{"train": {}, "test": {"a.jpg": {}}}')
+    for name in ("a.png", "a.exr", "mine.png"):
+        (tmp_path / "renders/test" / name).touch()
+    assert delete_files(tmp_path) == ["renders/test/mine.png"]
+    assert [path.name for path in tmp_path.rglob("*.*")] == ["mine.png"]
