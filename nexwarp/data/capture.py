@@ -1,5 +1,7 @@
 """The content of a scene's files without pixels: photos with their cameras, and points."""
 
+import os
+import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -10,8 +12,10 @@ import numpy as np
 
 from nexwarp.data.lens import Lens
 from nexwarp.errors import MissingError, NexwarpError, SceneError
+from nexwarp.io.files import one_line
 
 MAX_PART, MAX_PATH = 240, 1024  # bytes of a part of a file's path, and of the path
+PICTURES = frozenset(f".{name}" for name in "jpg jpeg png webp tif tiff bmp ppm pgm pnm gif tga jp2 j2k avif".split())
 MOST_NAMED = 100  # missing photos in a message
 LARGEST_COORDINATE = 1e15  # its square is finite in single precision
 
@@ -94,12 +98,18 @@ def scene_errors() -> Iterator[None]:
         raise SceneError(str(error)) from error
 
 
-def safe_name(where: str, name: str, folder: str) -> str:
+def safe_name(where: str, name: str, folder: str, root: Path | None = None) -> str:
     """Normalise a path relative to the `folder` of a message: "/" as separator, without ".".
+
+    An absolute path below `root`, the folder itself, becomes a relative one.
 
     Raises:
         ValueError: the path is not printable, is absolute or has ".." on any operating system, or is too long.
     """
+    for base in () if root is None or not Path(name).is_absolute() else (root.absolute(), root.resolve()):
+        if Path(name).is_relative_to(base):
+            name = str(Path(name).relative_to(base))
+    name = name.replace("\\", "/")
     if (
         not name
         or not name.isprintable()
@@ -113,6 +123,15 @@ def safe_name(where: str, name: str, folder: str) -> str:
     if len(name.encode()) > MAX_PATH or any(len(part.encode()) > MAX_PART for part in path.parts):
         raise ValueError(f"{where} {short(name)}: expected at most {MAX_PART} bytes a part and {MAX_PATH} in all")
     return str(path)
+
+
+def find_file(folder: Path, name: str) -> Path:
+    """Return `folder / name`, with the parts of the name in the Unicode form that exists, if one does."""
+    path = folder
+    for part in PurePosixPath(name).parts:
+        forms = (part, *(unicodedata.normalize(form, part) for form in ("NFC", "NFD") if not part.isascii()))
+        path = next((path / form for form in forms if (path / form).exists()), path / part)
+    return path
 
 
 def inside_folder(where: str, path: Path, folder: Path, follow_links: bool) -> Path:
@@ -140,11 +159,33 @@ def report_missing(source: Path, names: Sequence[str], count: int, skip: bool) -
     """
     if not names:
         return
-    listed = ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" * (len(names) > MOST_NAMED))
-    absent = f"{source}: {len(names)} of {count} photos: image not found: {listed}"
+    absent = f"{source}: {len(names)} of {count} photos: image not found: {_listed(names, MOST_NAMED)}"
     if not skip or count - len(names) < 2:
         raise FileNotFoundError(absent if skip else f"{absent}; --skip-missing goes on without them")
     warnings.warn(f"{absent}; going on without them", stacklevel=2)
+
+
+def report_unused(source: Path, folder: Path, photos: Iterable[Photo]) -> None:
+    """Warn of pictures below the folder of the photos that are none of them."""
+    used = {_folded(photo.file) for photo in photos}
+    files = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
+    pictures = [file for file in files if file.suffix.lower() in PICTURES and not file.name.startswith(".")]
+    unused = sorted(str(file.relative_to(folder)) for file in pictures if _folded(file) not in used)
+    if unused:
+        warnings.warn(
+            f"{folder}: {len(unused)} of {len(pictures)} photos are not in {source}, so they are not used: "
+            f"{one_line(_listed(unused, 8), 400)}",
+            stacklevel=2,
+        )
+
+
+def _folded(file: Path) -> str:
+    """A path as file systems that tell neither case nor Unicode forms apart see it."""
+    return unicodedata.normalize("NFC", str(file)).casefold()
+
+
+def _listed(names: Sequence[str], most: int) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" * (len(names) > most))
 
 
 def distinct_photos(source: Path, photos: Iterable[Photo]) -> list[Photo]:

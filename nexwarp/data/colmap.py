@@ -1,6 +1,7 @@
 """COLMAP models: search for their files, and conversion of their records to photos and points."""
 
 import dataclasses
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -12,38 +13,59 @@ from nexwarp.data.capture import (
     Photo,
     check_points,
     distinct_photos,
+    find_file,
     inside_folder,
     safe_name,
 )
-from nexwarp.data.colmap_files import CameraRecord, ImageRecord, PointRecords, Records, read_binary, read_text
+from nexwarp.data.colmap_files import (
+    CameraRecord,
+    ImageRecord,
+    PointRecords,
+    Records,
+    count_images,
+    read_binary,
+    read_text,
+)
 from nexwarp.data.lens import Lens
 
 PARTS = ("cameras", "images", "points3D")
 FORMATS = ("bin", "txt")
-FOLDERS = ("sparse/0", "sparse", ".")
+
+
+def _folders(path: Path) -> list[Path]:
+    """Folders that a scene's models lie in: sparse/0, sparse/1 and so on, sparse and the scene's folder itself."""
+    numbered = [folder for folder in (path / "sparse").glob("*") if folder.name.isdecimal()]
+    return [*sorted(numbered, key=lambda folder: int(folder.name)), path / "sparse", path]
 
 
 def has_model(path: Path) -> bool:
     """Whether a file of a COLMAP model exists in a folder that `find_model` searches."""
-    return any((path / folder / f"{part}.{end}").is_file() for folder in FOLDERS for part in PARTS for end in FORMATS)
+    return any((folder / f"{part}.{end}").is_file() for folder in _folders(path) for part in PARTS for end in FORMATS)
 
 
 def find_model(path: Path) -> tuple[Path, str]:
     """Return the folder of a scene's COLMAP model and its format, "bin" (preferred) or "txt".
 
-    The folders sparse/0, sparse and `path` itself are searched in this order.
+    Of several models it is the one with the most registered photos, else the first of sparse/0, sparse/1 and so on,
+    sparse and `path` itself.
 
     Raises:
         FileNotFoundError: there is no complete model; the message names the missing files of a partial one.
     """
     partial = None
-    for folder in (path / name for name in FOLDERS):
-        for suffix in FORMATS:
-            missing = [f"{part}.{suffix}" for part in PARTS if not (folder / f"{part}.{suffix}").is_file()]
-            if not missing:
-                return folder, suffix
-            if len(missing) < len(PARTS) and partial is None:
-                partial = f"{path}: incomplete COLMAP model in {folder}: {' and '.join(missing)} not found"
+    models = []
+    for folder in _folders(path):
+        missing = {
+            end: [f"{part}.{end}" for part in PARTS if not (folder / f"{part}.{end}").is_file()] for end in FORMATS
+        }
+        complete = [end for end in FORMATS if not missing[end]]
+        if complete:
+            models.append((folder, complete[0]))
+        for names in missing.values():
+            if len(names) < len(PARTS) and partial is None:
+                partial = f"{path}: incomplete COLMAP model in {folder}: {' and '.join(names)} not found"
+    if models:
+        return models[0] if len(models) == 1 else max(models, key=lambda model: count_images(*model))
     raise FileNotFoundError(
         partial
         or f"{path}: no COLMAP model found, expected cameras, images and points3D (.bin or .txt) "
@@ -65,7 +87,11 @@ def read_model(path: Path, images: Path, follow_links: bool = False) -> Capture:
             the images folder or occurs twice, or points that are not finite.
     """
     folder, suffix = find_model(path)
-    records = (read_binary if suffix == "bin" else read_text)(folder)
+    return capture_of((read_binary if suffix == "bin" else read_text)(folder), folder, images, follow_links)
+
+
+def capture_of(records: Records, folder: Path, images: Path, follow_links: bool) -> Capture:
+    """Convert the records of a model; `folder` names it in messages. Arguments and errors are those of `read_model`."""
     if not records.images:
         raise ValueError(f"{folder}: the COLMAP model has no registered images")
     lenses: dict[int, Lens] = {}
@@ -73,10 +99,9 @@ def read_model(path: Path, images: Path, follow_links: bool = False) -> Capture:
     photos = distinct_photos(folder, each)
     if not len(records.points.ids):
         return Capture(folder, sorted(photos, key=lambda photo: photo.name), None)
+    records = dataclasses.replace(records, points=_without_strays(records, folder))
     cloud = _cloud(records.points, folder)
-    photos = [
-        dataclasses.replace(photo, points=points) for photo, points in zip(photos, _seen(records, folder), strict=True)
-    ]
+    photos = [dataclasses.replace(photo, points=points) for photo, points in zip(photos, _seen(records), strict=True)]
     return Capture(folder, sorted(photos, key=lambda photo: photo.name), cloud)
 
 
@@ -88,9 +113,9 @@ def _photo(
     images: Path,
     follow_links: bool,
 ) -> Photo:
-    name = safe_name(f"{folder}: image name", image.name, "images folder")
+    name = safe_name(f"{folder}: image name", image.name, "images folder", images)
     where = f"{folder}: {name}"
-    file = inside_folder(f"{folder}: image name", images / name, images, follow_links)
+    file = inside_folder(f"{folder}: image name", find_file(images, name), images, follow_links)
     if image.camera not in cameras:
         raise ValueError(f"{where}: expected a camera of the model, got id {image.camera}")
     if image.camera not in lenses:
@@ -118,21 +143,30 @@ def _viewmat(where: str, pose: tuple[float, ...]) -> np.ndarray:
     return viewmat
 
 
-def _seen(records: Records, folder: Path) -> list[np.ndarray]:
+def _without_strays(records: Records, folder: Path) -> PointRecords:
+    """Leave out, with a warning, observations of images that the model does not have."""
+    points = records.points
+    known = np.isin(points.seen_by, np.array(list(records.images), np.uint32))
+    if known.all():
+        return points
+    strays = np.unique(points.seen_by[~known])
+    warnings.warn(
+        f"{folder}: {(~known).sum():,} observations of points are of {len(strays):,} images that the model does not "
+        f"have, such as id {strays[0]}; left out",
+        stacklevel=2,
+    )
+    kept = points.points[known]
+    lengths = np.bincount(kept, minlength=len(points.ids))
+    return dataclasses.replace(points, seen_by=points.seen_by[known], points=kept, lengths=lengths)
+
+
+def _seen(records: Records) -> list[np.ndarray]:
     """For each image, the (M, 3) float32 positions of the points that were triangulated from it, by ascending id."""
     points = records.points
     identities = np.array(list(records.images), np.int64)
     ascending = np.argsort(identities)
     # Observations are the largest arrays of a model, so they are processed in place.
     pairs = np.searchsorted(identities[ascending].astype(np.uint32), points.seen_by)
-    np.minimum(pairs, len(identities) - 1, out=pairs)
-    known = identities[ascending].astype(np.uint32)[pairs] == points.seen_by
-    if not known.all():
-        first = int(np.flatnonzero(~known)[0])
-        raise ValueError(
-            f"{folder}: damaged, point {points.ids[points.points[first]]} is seen by image {points.seen_by[first]}, "
-            "which the model does not have"
-        )
     # Sort by image, then by point, and remove duplicates.
     pairs *= len(points.ids)
     pairs += points.points

@@ -5,9 +5,10 @@ truncated file, aborts the process on some damaged files, and creates a Python o
 which repeat the poses of the images, are not read.
 """
 
+import codecs
 import struct
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ LARGEST_ID = 2**32 - 1  # of an image, as binary files hold it
 MAX_OBSERVATIONS = 100_000_000
 MAX_NAME = 4096  # bytes
 MAX_LINE = 64 * 2**20  # bytes of a line of a text file, enough for a million keypoints
+KEYPOINT_BYTES = b"0123456789+-.eEinfaINFA \t"  # of numbers, nan and inf
 CAMERA, IMAGE, POINT = struct.Struct("<IiQQ"), struct.Struct("<I7dI"), 51
 POINT_RECORD = np.dtype(
     {
@@ -106,6 +108,14 @@ def read_text(folder: Path) -> Records:
     cameras = _unique(folder / "cameras.txt", (_text_camera(where, line) for where, line in lines), MAX_CAMERAS)
     images = _unique(folder / "images.txt", _text_images(folder / "images.txt"), MAX_IMAGES)
     return Records(cameras, images, _text_points(folder / "points3D.txt"))
+
+
+def count_images(folder: Path, suffix: str) -> int:
+    """Number of registered images of the model in a folder, "bin" or "txt"; errors are those of the readers."""
+    if suffix == "txt":
+        return sum(1 for _ in _text_images(folder / "images.txt"))
+    with (folder / "images.bin").open("rb") as file:
+        return _Reader(folder / "images.bin", file).count(MAX_IMAGES)
 
 
 class _Reader:
@@ -207,22 +217,31 @@ def _binary_points(file: _Reader) -> PointRecords:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
-    """Yield each line with its place for messages; comments and empty lines are skipped."""
-    return ((where, line) for where, line in _all_lines(path) if line and not line.startswith(b"#"))
-
-
-def _all_lines(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Yield each line with its place for messages, without a byte order mark, comments and empty lines."""
     with path.open("rb") as file:
         number = 0
         while line := file.readline(MAX_LINE):
             number += 1
             if len(line) == MAX_LINE:
                 raise ValueError(f"{path}: line {number}: expected at most {MAX_LINE:,} bytes")
-            yield f"{path}: not a readable COLMAP model: line {number}", line.strip()
+            line = line.removeprefix(codecs.BOM_UTF8).strip()
+            if line and not line.startswith(b"#"):
+                yield f"{path}: not a readable COLMAP model: line {number}", line
 
 
 def _unreadable(where: str, expected: str, line: bytes) -> ValueError:
     return ValueError(f"{where}: expected {expected}, got {line[:60].decode('ascii', 'backslashreplace')!r}")
+
+
+def _integers(words: Sequence[bytes]) -> list[int]:
+    """Integers of words such as 12, 12.0 and 1.2e1; ValueError for other numbers."""
+    try:
+        return [int(word) for word in words]
+    except ValueError:
+        numbers = [float(word) for word in words]
+        if not all(number.is_integer() for number in numbers):
+            raise
+        return [int(number) for number in numbers]
 
 
 def _text_camera(where: str, line: bytes) -> tuple[int, CameraRecord]:
@@ -231,26 +250,27 @@ def _text_camera(where: str, line: bytes) -> tuple[int, CameraRecord]:
         known = {name.encode(): count for name, count in camera_models().values()}
         if known.get(model) != len(params):
             raise ValueError
-        return int(identity), CameraRecord(model.decode(), tuple(map(float, params)), int(width), int(height))
+        numbers = _integers((identity, width, height))
+        return numbers[0], CameraRecord(model.decode(), tuple(map(float, params)), *numbers[1:])
     except ValueError:
         expected = "id, model, width, height and the model's parameters of a camera"
         raise _unreadable(where, expected, line) from None
 
 
 def _text_images(path: Path) -> Iterator[tuple[int, ImageRecord]]:
-    lines = _all_lines(path)
-    for where, line in lines:
-        if not line or line.startswith(b"#"):
-            continue
+    """Read images; their lines of keypoints, which some programs leave out, are told by their content."""
+    for where, line in _lines(path):
+        if not line.translate(None, KEYPOINT_BYTES) and len(line.split()) % 3 == 0:
+            continue  # triples of x, y and a point's id
         try:
-            identity, *pose, camera, name = line.split(None, 9)
-            numbers = int(identity), tuple(map(float, pose)), int(camera)
-            if len(pose) != 7 or not 0 <= numbers[0] <= LARGEST_ID:
+            *numbers, name = line.split(None, 9)
+            pose = tuple(map(float, numbers[1:8]))
+            identity, camera = _integers((numbers[0], numbers[8]))
+            if not 0 <= identity <= LARGEST_ID:
                 raise ValueError
-        except ValueError:
-            raise _unreadable(where, "id, pose, camera and name of an image", line) from None
-        yield numbers[0], ImageRecord(*numbers[1:], _decoded(path, name))
-        next(lines, None)  # keypoints
+        except (ValueError, IndexError):
+            raise _unreadable(where, "id, pose, camera and name of an image, or its keypoints", line) from None
+        yield identity, ImageRecord(pose, camera, _decoded(path, name))
 
 
 def _text_points(path: Path) -> PointRecords:
@@ -258,10 +278,10 @@ def _text_points(path: Path) -> PointRecords:
     for where, line in _lines(path):
         words = line.split()
         try:
-            ids.append(int(words[0]))
+            ids.extend(_integers(words[:1]))
             values.extend(map(float, (*words[1:4], words[7])))
-            colors.extend(map(int, words[4:7]))
-            seen_by.extend(map(int, words[8::2]))
+            colors.extend(_integers(words[4:7]))
+            seen_by.extend(_integers(words[8::2]))
             lengths.append(len(words[8::2]))
             if len(words) % 2:
                 raise ValueError

@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.data.background import parse_color
-from nexwarp.data.capture import Capture, Cloud, Photo, report_missing, scene_errors
+from nexwarp.data.capture import Capture, Cloud, Photo, report_missing, report_unused, scene_errors
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.demo import demo_folder
 from nexwarp.data.images import quiet_pillow
@@ -348,6 +348,7 @@ def _read_capture(source: SceneSource, path: Path, kind: str) -> Capture:
         photos = [photo for photo in capture.photos if photo.file.is_file()]
         missing = [photo.name for photo in capture.photos if not photo.file.is_file()]
         report_missing(capture.source, missing, len(capture.photos), source.skip_missing)
+        report_unused(capture.source, path / source.images, capture.photos)
         return dataclasses.replace(capture, photos=photos)
     if source.images != "images":
         _check_folder("images", path, source.images)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.data.capture import Photo
+from nexwarp.data.capture import Photo, find_file
 from nexwarp.data.images import (
     compose,
     downscale_image,
@@ -177,9 +177,10 @@ def _face(photo: Photo, face: str) -> Photo:
 
 def find_mask(folder: Path, name: str) -> Path | None:
     """Find the mask of a photo in a folder: its name with ".png" appended, or its stem with another suffix, or None."""
-    path = folder / name
+    path = PurePosixPath(name)
     candidates = [path.with_name(f"{path.name}.png"), *(path.with_suffix(suffix) for suffix in MASK_SUFFIXES)]
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    files = (find_file(folder, str(candidate)) for candidate in candidates)
+    return next((file for file in files if file.is_file()), None)
 
 
 def _mask(photo: Photo, image: torch.Tensor, alpha: torch.Tensor | None) -> torch.Tensor | None:

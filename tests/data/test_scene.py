@@ -267,7 +267,7 @@ BAD_SCENES = {
     "garbage text": (damaged("sparse/0/images.txt", lambda _: b"what\n", text=True), "not a readable COLMAP"),
     "image id beyond 32 bits": (
         damaged("sparse/0/images.txt", lambda data: re.sub(rb"(?m)^1 ", b"18446744073709551617 ", data), text=True),
-        "expected id, pose, camera and name of an image, got '18446744073709551617",
+        "expected id, pose, camera and name of an image, or its keypoints, got '18446744073709551617",
     ),
     "focal length of zero": (
         built(params=(0.0, 43.0, 25.5, 16.25)),
