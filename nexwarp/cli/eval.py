@@ -34,7 +34,7 @@ class Eval:
     scene: Annotated[str | None, option("SCENE", "the folder of the training")] = None
     """Folder of the scene, if it has moved; required for a model alone."""
     metrics: Annotated[tuple[str, ...], option("{psnr,ssim,flip,lpips} ...", "psnr ssim")] = ("psnr", "ssim")
-    """Metrics to compute; flip and lpips need the extras `flip` and `lpips`."""
+    """Metrics to compute; flip needs the extra `flip`, lpips a file of weights (docs/quality.md)."""
     refine_poses: Flag_ = False
     """Fit each test pose to its photo before it is judged, the model fixed; metrics.json says so."""
     device: Device_ = None

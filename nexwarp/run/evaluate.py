@@ -17,10 +17,10 @@ from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model
 from nexwarp.ops.ssim import ssim_map
 from nexwarp.run.folder import COMPARE, TEST, picture_name
+from nexwarp.run.lpips import load_vgg, weights_file
 from nexwarp.train.ranks.ranks import Ranks
 
 PIXELS_PER_DEGREE = 67.02064514160156  # FLIP's default: a display 0.7 m and 3840 pixels wide, from 0.7 m
-PACKAGES = {"flip": ("flip_evaluator", "flip-evaluator"), "lpips": ("lpips", "lpips")}  # module and package
 CONVENTION = (
     "From 8-bit images (float images are clamped to [0, 1] and rounded). PSNR: per image over all pixels and "
     "channels. SSIM: 11x11 Gaussian window, sigma 1.5, per channel, zero 'same' padding, C1 = 0.01^2, "
@@ -159,16 +159,16 @@ def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
 
 
 def lpips_vgg(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float | None:
-    """LPIPS (VGG, v0.1) of two images as of `ssim`; None, with one warning, if it is not available.
+    """LPIPS (VGG, v0.1) of two images as of `ssim`, at least 16 pixels a side; None, with one warning, without weights.
 
-    It needs the `lpips` package (`pip install nexwarp[lpips]`), which downloads the VGG weights on first use.
+    The weights come from $NEXWARP_LPIPS, the cache folder or the package `lpips` (docs/quality.md).
     """
     x, y = _unit_images(image, target, mask)
-    network = _lpips_network(x.device)
-    if network is None:
+    distance = _lpips_distance(x.device)
+    if distance is None:
         return None
     with torch.no_grad():
-        return network(x.permute(2, 0, 1)[None], y.permute(2, 0, 1)[None], normalize=False).item()
+        return distance(x, y).item()
 
 
 def flip(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float | None:
@@ -195,32 +195,39 @@ def check_metrics(metrics: Sequence[str], device: torch.device) -> None:
     for name in metrics:
         if name not in METRICS:
             raise SettingError(f"metrics: expected some of {', '.join(METRICS)}, got {name!r}")
-        module, package = PACKAGES.get(name, ("", ""))
-        if module and importlib.util.find_spec(module) is None:
-            raise SettingError(
-                f"--metrics: {name} needs the package {package}, which is not installed: pip install 'nexwarp[{name}]'"
-            )
+    if "flip" in metrics and importlib.util.find_spec("flip_evaluator") is None:
+        raise SettingError(
+            "--metrics: flip needs the package flip-evaluator, which is not installed: pip install 'nexwarp[flip]'"
+        )
     if "lpips" in metrics:
         try:
             _load_lpips(device)
-        except (ImportError, OSError, RuntimeError) as error:
+        except (ImportError, OSError, RuntimeError, ValueError) as error:
             raise SettingError(f"--metrics: lpips cannot be computed: {one_line(error)}") from None
 
 
-def _load_lpips(device: torch.device) -> torch.nn.Module:
-    import lpips
-
+def _load_lpips(device: torch.device) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
+    """Return LPIPS as a function of two (H, W, 3) images in [0, 1]."""
+    if (file := weights_file()).is_file():
+        return load_vgg(file)
+    try:
+        import lpips
+    except ImportError as error:
+        raise ImportError(
+            f"{error}, and {file} does not exist: `python -m benchmarks.lpips_weights` writes it"
+        ) from None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torchvision deprecates the arguments that lpips passes
-        return lpips.LPIPS(net="vgg", version="0.1", verbose=False).eval().to(device)
+        network = lpips.LPIPS(net="vgg", version="0.1", verbose=False).eval().to(device)
+    return lambda x, y: network(x.permute(2, 0, 1)[None], y.permute(2, 0, 1)[None], normalize=False)
 
 
 @lru_cache(maxsize=2)
-def _lpips_network(device: torch.device) -> torch.nn.Module | None:
+def _lpips_distance(device: torch.device) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None:
     try:
         return _load_lpips(device)
-    except (ImportError, OSError, RuntimeError) as error:
-        warnings.warn(f"LPIPS is left out: {error} (pip install nexwarp[lpips])", RuntimeWarning, stacklevel=3)
+    except (ImportError, OSError, RuntimeError, ValueError) as error:
+        warnings.warn(f"LPIPS is left out: {one_line(error)}", RuntimeWarning, stacklevel=3)
         return None
 
 

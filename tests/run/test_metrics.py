@@ -2,17 +2,20 @@
 
 import math
 import sys
-import types
 import warnings
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 import skimage.metrics
 import torch
+from safetensors.torch import save_file
 
+from nexwarp.errors import SettingError
 from nexwarp.io.pictures import to_uint8
 from nexwarp.ops import ssim as ops_ssim
 from nexwarp.run import evaluate as metrics
+from nexwarp.run.lpips import BLOCKS, load_vgg
 
 
 def images(height: int = 48, width: int = 61) -> list[torch.Tensor]:
@@ -95,40 +98,60 @@ def test_to_uint8_rounds_and_clamps() -> None:
         to_uint8(torch.zeros(3, dtype=torch.int64))
 
 
-class FakeLPIPS(torch.nn.Module):
-    """Stands for the package's network: keeps what it was given, answers with the mean difference."""
-
-    def __init__(self, **options: object) -> None:
-        super().__init__()
-        self.options = options
-
-    def forward(self, x: torch.Tensor, y: torch.Tensor, normalize: bool) -> torch.Tensor:
-        assert self.options == {"net": "vgg", "version": "0.1", "verbose": False}
-        assert not self.training and not normalize and x.shape[:2] == (1, 3)
-        return (x - y).mean().view(1, 1, 1, 1)
+def vgg_weights() -> dict[str, torch.Tensor]:
+    """Random weights by the names of torchvision's VGG-16, in place of the real 29 MB."""
+    generator, channels = torch.Generator().manual_seed(0), 3
+    weights: dict[str, torch.Tensor] = {}
+    for block, (layers, width) in enumerate(zip(BLOCKS, (64, 128, 256, 512, 512), strict=True)):
+        for layer in layers:
+            kernel = torch.randn(width, channels, 3, 3, generator=generator) * (2 / (9 * channels)) ** 0.5
+            weights |= {f"{layer}.weight": kernel, f"{layer}.bias": torch.zeros(width)}
+            channels = width
+        weights[f"lin{block}"] = torch.rand(width, generator=generator)
+    return weights
 
 
 @pytest.fixture
-def fresh_network() -> Iterator[None]:
-    metrics._lpips_network.cache_clear()
-    yield
-    metrics._lpips_network.cache_clear()
-
-
-def test_lpips_gets_images_in_0_1(monkeypatch: pytest.MonkeyPatch, fresh_network: None) -> None:
-    monkeypatch.setitem(sys.modules, "lpips", types.SimpleNamespace(LPIPS=FakeLPIPS))
-    white, black = torch.full((8, 9, 3), 255, dtype=torch.uint8), torch.zeros(8, 9, 3)
-    assert metrics.lpips_vgg(white, black) == 1.0
-
-
-def test_lpips_is_left_out_with_one_warning(monkeypatch: pytest.MonkeyPatch, fresh_network: None) -> None:
+def no_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
+    """The file of LPIPS's weights, which does not exist; and no package `lpips`."""
+    monkeypatch.setenv("NEXWARP_LPIPS", str(tmp_path / "vgg16.safetensors"))
     monkeypatch.setitem(sys.modules, "lpips", None)
-    image = torch.zeros(8, 9, 3)
-    with pytest.warns(RuntimeWarning, match=r"LPIPS is left out.*pip install nexwarp\[lpips\]"):
+    metrics._lpips_distance.cache_clear()
+    yield tmp_path / "vgg16.safetensors"
+    metrics._lpips_distance.cache_clear()
+
+
+def test_lpips_is_that_of_its_authors(no_weights: Path) -> None:
+    """The values are those of the package lpips 0.1.4 with these weights, images in [0, 1]."""
+    generator = torch.Generator().manual_seed(1)
+    image = torch.rand(40, 48, 3, generator=generator)
+    noisy = (image + 0.2 * torch.randn(40, 48, 3, generator=generator)).clamp(0, 1)
+    blurred = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1)[None], 5, 1, 2)[0].permute(1, 2, 0)
+    save_file(vgg_weights(), no_weights)
+    distance = load_vgg(no_weights)
+    assert distance(image, noisy).item() == pytest.approx(0.0870887, rel=1e-5)
+    assert distance(image, blurred).item() == pytest.approx(0.2263193, rel=1e-5)
+    eighth = metrics.lpips_vgg(image, noisy)  # of 8-bit images
+    assert eighth is not None and abs(eighth - 0.0870887) < 1e-3 and metrics.lpips_vgg(image, image) == 0.0
+
+
+def test_lpips_without_weights_is_left_out_with_one_warning(no_weights: Path) -> None:
+    image = torch.zeros(16, 17, 3)
+    with pytest.warns(RuntimeWarning, match=r"LPIPS is left out.*vgg16.*python -m benchmarks.lpips_weights"):
         assert metrics.lpips_vgg(image, image) is None
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert metrics.lpips_vgg(image, image) is None
+
+
+def test_damaged_lpips_weights_are_named(no_weights: Path) -> None:
+    incomplete = {name: values[:1] for name, values in vgg_weights().items() if name != "lin3"}
+    save_file(incomplete, no_weights)
+    with pytest.raises(SettingError, match=r"lpips cannot be computed: .*vgg16.safetensors: .*lin3 is missing"):
+        metrics.check_metrics(["lpips"], torch.device("cpu"))
+    no_weights.write_bytes(b"nothing")
+    with pytest.raises(SettingError, match=r"lpips cannot be computed: .*vgg16.safetensors: damaged"):
+        metrics.check_metrics(["lpips"], torch.device("cpu"))
 
 
 # Masks, and FLIP

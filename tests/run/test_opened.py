@@ -1,6 +1,7 @@
 """Models that Python saved open in view, render, export, info and eval, with or without a run around them."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -90,14 +91,23 @@ def test_the_ring_around_a_scene_sees_its_middle() -> None:
         assert seen.float().mean() > 0.8
 
 
-@pytest.mark.parametrize("metric", ["lpips", "flip"])
+@pytest.mark.parametrize(
+    ("metric", "remedy"), [("flip", "pip install 'nexwarp[flip]'"), ("lpips", "python -m benchmarks.lpips_weights")]
+)
 def test_a_metric_without_its_package_is_one_line(
-    metric: str, model: nw.Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    metric: str,
+    remedy: str,
+    model: nw.Model,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     model.save(tmp_path / "run")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setenv("NEXWARP_LPIPS", str(tmp_path / "vgg16.safetensors"))
+    monkeypatch.setitem(sys.modules, "lpips", None)
     line = refused(capsys, "eval", tmp_path / "run", "--scene", "nowhere", "--metrics", metric)
-    assert f"--metrics: {metric} needs the package" in line and f"pip install 'nexwarp[{metric}]'" in line
+    assert f"--metrics: {metric}" in line and remedy in line
 
 
 def test_a_model_beside_a_run_of_its_name_leaves_the_run_alone(model: nw.Model, tmp_path: Path) -> None:
