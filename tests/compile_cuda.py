@@ -31,6 +31,7 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "with_errors": (False, True),
     "fixed_point": (False, True),
     "by_place": (False,),  # True is for CPUs
+    "wide": (False, True),
 }
 ALL = VALUES | {"max_hits": tuple(range(MAX_HITS + 1))}
 FUSED = VALUES | {"features": (2, 4)}

@@ -7,6 +7,7 @@ A thread is a pixel (see `walk`). Read: the surfels' records and limits, and the
     ids, depths, weights    the K heaviest hits, heaviest first; on a tie the nearer one stays
     alphas   1 - final transmittance
     stops    end of the part of the walk that was taken
+    channels wide: as plain, of sixteen more channels
 
 A hit counts where alpha >= 1/255 and its depth lies beyond `near`; the walk ends behind the hit that takes the
 transmittance below 1e-4. `collect_backward` differentiates all outputs but ids and stops with respect to records.
@@ -34,6 +35,7 @@ def hit_buffer(real: type, max_hits: int) -> SimpleNamespace:
     slots = max(max_hits, 1)  # one unused slot for K = 0
     reals = wp.types.vector(length=slots, dtype=real)
     integers = wp.types.vector(length=slots, dtype=wp.int32)
+    t = types(real)
 
     @wp.func
     def empty():
@@ -43,7 +45,61 @@ def hit_buffer(real: type, max_hits: int) -> SimpleNamespace:
             ids[j] = -1
         return ids, reals()
 
-    return SimpleNamespace(reals=reals, integers=integers, empty=empty)
+    @wp.func
+    def write(surfels: t.Surfels, hits: t.Hits, p: wp.int32, ids: integers, weights: reals, d: t.vec2):
+        """Write the buffer of pixel p, whose ray is d; return the blended colour of its hits."""
+        base = t.vec3()
+        for j in range(wp.static(max_hits)):
+            i = ids[j]
+            depth = real(0.0)
+            if i >= 0:
+                a, b, n, c = load_record(surfels.records, i)
+                base += t.vec3(c[0], c[1], c[2]) * weights[j]
+                _u, _v, depth = hit(a, b, n, c[3], d)
+            hits.ids[p, j] = i
+            hits.depths[p, j] = depth
+            hits.weights[p, j] = weights[j]
+        return base
+
+    return SimpleNamespace(reals=reals, integers=integers, empty=empty, write=write)
+
+
+@functools.cache
+def channel_functions(real: type, wide: bool) -> SimpleNamespace:
+    """Make the functions of the sixteen more channels of a wide walk, a mat44; others do nothing."""
+    t = types(real)
+    mat44, Surfels, Hits = t.mat44, t.Surfels, t.Hits
+
+    @wp.func
+    def load(rows: wp.array2d(dtype=t.vec4), i: wp.int32):
+        """Row i of an array of channels."""
+        result = mat44()
+        if wp.static(wide):
+            a, b, c, d = load_record(rows, i)
+            result = wp.matrix_from_rows(a, b, c, d)
+        return result
+
+    @wp.func
+    def blend(surfels: Surfels, i: wp.int32, weight: real, total: mat44):
+        """Add weight times the channels of surfel i; i = -1 has the weight 0."""
+        return total + load(surfels.channels, wp.max(i, 0)) * weight
+
+    @wp.func
+    def store(hits: Hits, p: wp.int32, total: mat44):
+        """Write the channels of pixel p."""
+        if wp.static(wide):
+            for row in range(4):
+                hits.channels[p, row] = total[row]
+
+    @wp.func
+    def product(rows: wp.array2d(dtype=t.vec4), i: wp.int32, grad: mat44):
+        """Inner product of row i and a gradient."""
+        result = real(0.0)
+        if wp.static(wide):
+            result = wp.ddot(load(rows, i), grad)
+        return result
+
+    return SimpleNamespace(load=load, blend=blend, store=store, product=product)
 
 
 @wp.func
@@ -55,17 +111,17 @@ def alpha_if_near(u: Any, v: Any, limit: Any, opacity: Any, g1: Any, g2: Any):
     return alpha
 
 
-def _launch_bounds(real: type, max_hits: int) -> int | tuple[int, int]:
+def _launch_bounds(real: type, max_hits: int, wide: bool) -> int | tuple[int, int]:
     """Where registers are few, as many blocks at once as 64 registers allow."""
-    return (BLOCK_DIM, 8) if real is wp.float32 and max_hits <= 2 else BLOCK_DIM
+    return (BLOCK_DIM, 8) if real is wp.float32 and max_hits <= 2 and not wide else BLOCK_DIM
 
 
 @functools.cache
-def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
-    """Make the forward kernel."""
+def collect_kernel(real: type, max_hits: int, wide: bool = False) -> wp.Kernel:
+    """Make the forward kernel; a wide one blends sixteen more channels."""
     t = types(real)
     vec3 = t.vec3
-    buffer = hit_buffer(real, max_hits)
+    buffer, channels = hit_buffer(real, max_hits), channel_functions(real, wide)
     ALPHA_MIN, TRANSMITTANCE_MIN, ZERO, ONE = t.ALPHA_MIN, t.TRANSMITTANCE_MIN, t.ZERO, t.ONE
 
     @wp.kernel(
@@ -73,7 +129,7 @@ def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
         grid_stride=False,
         module="unique",
         module_options={"fast_math": real is wp.float32},
-        launch_bounds=_launch_bounds(real, max_hits),
+        launch_bounds=_launch_bounds(real, max_hits, wide),
     )
     def collect(first: wp.int32, surfels: t.Surfels, lists: TileLists, view: t.View, hits: t.Hits):
         thread = first + wp.tid()
@@ -83,6 +139,7 @@ def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
         # pixels whose walk has ended: their transmittance is too low.
         transmittance = wp.where(inside, ONE, ZERO)
         color = vec3()
+        more = t.mat44()
         ids, weights = buffer.empty()
         overflow = overflowed(lists)
         bounds = walk(tile_of(thread), lists, overflow)
@@ -121,23 +178,15 @@ def collect_kernel(real: type, max_hits: int) -> wp.Kernel:
                             # empty slot comes the weight 0.
                             c = record_row(surfels.records, wp.max(i, 0), 3)
                     color += vec3(c[0], c[1], c[2]) * weight
+                    if wp.static(wide):
+                        more = channels.blend(surfels, i, weight, more)
         if not inside:
             return
         p = xy[1] * view.size[0] + xy[0]
-        base = vec3()
-        for j in range(wp.static(max_hits)):
-            i = ids[j]
-            depth = real(0.0)
-            if i >= 0:
-                a, b, n, c = load_record(surfels.records, i)
-                base += vec3(c[0], c[1], c[2]) * weights[j]
-                u, v, depth = hit(a, b, n, c[3], d)
-            hits.ids[p, j] = i
-            hits.depths[p, j] = depth
-            hits.weights[p, j] = weights[j]
+        hits.base[p] = buffer.write(surfels, hits, p, ids, weights, d)
         hits.plain[p] = color
-        hits.base[p] = base
         hits.alphas[p] = ONE - transmittance
         hits.stops[p] = stop
+        channels.store(hits, p, more)
 
     return collect

@@ -4,6 +4,7 @@ A thread is a pixel (see `walk`). Read: what `collect` read and wrote, and the g
 Added to:
 
     records    gradients of the surfels' records
+    channels   wide: gradients of their sixteen more channels
     errors     with_errors: sum over pixels of weight * error, for densification (paper Sec. 4.3)
 
 With `by_place`, gradients of the walk's place k go to gradient slot slots[k], which one CPU thread owns and `reduce`
@@ -16,7 +17,9 @@ is therefore written by hand. With q_i = dL/dw_i,
 
 where the sum over all i is known from the outputs,
 
-    rest = gN . N + gB . B + sum_k gW_k W_k + gA A,
+    rest = gN . N + gB . B + sum_k gW_k W_k + gA A
+
+(N with the channels of a wide kernel),
 
 and the walk subtracts its terms one by one. Of each hit, seven derivatives are computed, with respect to a . d, b . d,
 n . d and the like (see `hit_gradients`); the record's follow by products with the ray and the weight. Frozen: the
@@ -28,7 +31,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from nexwarp.kernels.collect import hit_buffer
+from nexwarp.kernels.collect import channel_functions, hit_buffer
 from nexwarp.kernels.shape import alpha_at, far_outside
 from nexwarp.kernels.surfel import hit, hit_gradients, record_gradients
 from nexwarp.kernels.types import TileLists, types
@@ -57,6 +60,7 @@ def gradient_types(real: type, fixed_point: bool = False) -> SimpleNamespace:
         weights: wp.array2d(dtype=real)
         alphas: wp.array(dtype=real)
         errors: wp.array(dtype=real)
+        channels: wp.array2d(dtype=t.vec4)
 
     @wp.struct
     class Sums:
@@ -66,6 +70,7 @@ def gradient_types(real: type, fixed_point: bool = False) -> SimpleNamespace:
         records: pairs if fixed_point else wp.array2d(dtype=t.vec4)
         errors: pairs if fixed_point else wp.array(dtype=real)
         bad: wp.array(dtype=wp.int32)
+        channels: pairs if fixed_point else wp.array2d(dtype=t.vec4)
 
     return SimpleNamespace(HitGradients=HitGradients, Sums=Sums)
 
@@ -88,6 +93,22 @@ def add_function(real: type, fixed_point: bool, by_place: bool) -> wp.Function:
         return slot
 
     return add
+
+
+@functools.cache
+def add_channels_function(real: type, fixed_point: bool, wide: bool) -> wp.Function:
+    """Make the function that adds the sum over a warp of channels' gradients to a slot, in a wide walk."""
+    Sums = gradient_types(real, fixed_point).Sums
+
+    @wp.func
+    def add_channels(sums: Sums, slot: wp.int32, grad: types(real).mat44):
+        if wp.static(wide):
+            if wp.static(fixed_point):
+                fixed_point_record_sum(sums.channels, slot, grad[0], grad[1], grad[2], grad[3], sums.bad)
+            else:
+                warp_record_sum(sums.channels, slot, grad[0], grad[1], grad[2], grad[3])
+
+    return add_channels
 
 
 @functools.cache
@@ -160,9 +181,14 @@ def reduce_slots_kernel(dtype: type) -> wp.Kernel:
 
 @functools.cache
 def collect_backward_kernel(
-    real: type, max_hits: int, with_errors: bool = False, fixed_point: bool = False, by_place: bool = False
+    real: type,
+    max_hits: int,
+    with_errors: bool = False,
+    fixed_point: bool = False,
+    by_place: bool = False,
+    wide: bool = False,
 ) -> wp.Kernel:
-    """Make the backward kernel.
+    """Make the backward kernel; a wide one differentiates sixteen more channels.
 
     With `by_place` each place of the walk has a slot of its own, `slots[k]`, instead of one a surfel.
     """
@@ -171,6 +197,7 @@ def collect_backward_kernel(
     g = gradient_types(real, fixed_point)
     buffer, buffered_gradients = hit_buffer(real, max_hits), buffered_gradients_function(real, max_hits)
     add, add_error = add_function(real, fixed_point, by_place), add_error_function(real, fixed_point, with_errors)
+    channels, add_channels = channel_functions(real, wide), add_channels_function(real, fixed_point, wide)
     ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
     @wp.kernel(
@@ -201,6 +228,8 @@ def collect_backward_kernel(
         grad_base = grads.base[p]
         grad_total = grads.alphas[p]
         rest = wp.dot(grad_plain, hits.plain[p]) + wp.dot(grad_base, hits.base[p]) + grad_total * hits.alphas[p]
+        grad_channels = channels.load(grads.channels, p)
+        rest += channels.product(hits.channels, p, grad_channels)
         ids = buffer.integers()
         grad_weights = buffer.reals()
         grad_depths = buffer.reals()
@@ -236,13 +265,16 @@ def collect_backward_kernel(
                 if any_in_warp(wp.where(alpha > ZERO, 1, 0)) != 0:
                     grad = t.vec7()
                     weight = alpha * transmittance
+                    plain_weight = weight
                     grad_color = grad_plain
                     if alpha > ZERO:
                         grad_weight, grad_depth, buffered = buffered_gradients(i, ids, grad_weights, grad_depths)
                         if buffered:
                             grad_color = grad_base
+                            plain_weight = ZERO
                         q = grad_total + grad_weight
                         q += grad_color[0] * c[0] + grad_color[1] * c[1] + grad_color[2] * c[2]
+                        q += wp.where(buffered, ZERO, channels.product(surfels.channels, i, grad_channels))
                         rest -= q * weight
                         grad_alpha = transmittance * q - rest / (ONE - alpha)
                         grad = hit_gradients(a, b, n, c[3], d, grad_alpha, grad_depth)
@@ -251,5 +283,6 @@ def collect_backward_kernel(
                     row_c = vec4(grad_color[0] * weight, grad_color[1] * weight, grad_color[2] * weight, grad[3])
                     target = add(sums, i, k, row_a, row_b, row_n, row_c)
                     add_error(sums, target, weight * error)
+                    add_channels(sums, target, grad_channels * plain_weight)
 
     return collect_backward

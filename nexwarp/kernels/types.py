@@ -59,6 +59,7 @@ def types(real: type) -> SimpleNamespace:
         records: wp.array2d(dtype=vec4)  # (N, 4) see `kernels.surfel`
         limits: wp.array(dtype=real)  # (N) see `shape.exponent_limit`
         reaches: wp.array(dtype=vec2)  # (N) see `shape.reach`
+        channels: wp.array2d(dtype=vec4)  # (N, 4) sixteen more channels of the plain colour
 
     @wp.struct
     class Hits:
@@ -71,6 +72,7 @@ def types(real: type) -> SimpleNamespace:
         weights: wp.array2d(dtype=real)
         alphas: wp.array(dtype=real)
         stops: wp.array(dtype=wp.int32)
+        channels: wp.array2d(dtype=vec4)
 
     @wp.struct
     class Surface:

@@ -28,6 +28,8 @@ from nexwarp.ops._interop import (
 from nexwarp.ops.project import Pinhole, Projection
 from nexwarp.ops.tiles import Tiles
 
+CHANNELS = 16  # of a wide walk, besides the three of every walk
+
 
 @dataclass
 class SplatErrorRequest:
@@ -54,6 +56,7 @@ class Hits:
         alpha: (H, W) 1 - final transmittance; differentiable.
         stops: (H, W) int32, end of the part of the tile's list that the pixel's walk took.
         error_request: request for blended errors, empty at first.
+        channels: (H, W, 16) as `plain`, of sixteen more channels; None without them; differentiable.
     """
 
     plain: torch.Tensor
@@ -64,23 +67,37 @@ class Hits:
     alpha: torch.Tensor
     stops: torch.Tensor
     error_request: SplatErrorRequest
+    channels: torch.Tensor | None = None
 
 
-def collect(projection: Projection, tiles: Tiles, camera: Pinhole, *, max_hits: int = 2) -> Hits:
-    """Walk every pixel's list front to back; differentiable with respect to the projection's records.
+def collect(
+    projection: Projection,
+    tiles: Tiles,
+    camera: Pinhole,
+    *,
+    max_hits: int = 2,
+    channels: torch.Tensor | None = None,
+) -> Hits:
+    """Walk every pixel's list front to back; differentiable with respect to the projection's records and `channels`.
 
     Args:
         projection: surfels in the camera's frame.
         tiles: their lists.
         camera: the image plane.
         max_hits: K, length of the buffer, 0 to 8.
+        channels: (N, 16) sixteen more channels of the plain colour, or None.
     """
     if not 0 <= max_hits <= MAX_HITS:
         raise ValueError(f"max_hits: expected 0 to {MAX_HITS}, got {max_hits}")
     request = SplatErrorRequest()
-    scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera)
-    plain, base, ids, depths, weights, alpha, stops = _Collect.apply(projection.records, scene, max_hits, request)
-    return Hits(plain, base, ids, depths, weights, alpha, stops, request)
+    if channels is not None:
+        check_tensors({"records": (projection.records, ("N", 4, 4)), "channels": (channels, ("N", CHANNELS))})
+        channels = channels.contiguous()
+    stored = None if channels is None else channels.detach()
+    scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera, stored)
+    outputs = _Collect.apply(projection.records, channels, scene, max_hits, request)
+    plain, base, ids, depths, weights, alpha, stops, more = outputs
+    return Hits(plain, base, ids, depths, weights, alpha, stops, request, more)
 
 
 def splat_error(
@@ -104,18 +121,22 @@ def splat_error(
     outputs = tuple(x.detach() for x in buffers)
     plain, base, _ids, depths, weights, alpha, _stops = (torch.zeros_like(x) for x in outputs)
     errors = errors.detach().to(scene.records.dtype).contiguous()
-    _, sums = _backward(scene, outputs, (plain, base, depths, weights, alpha), errors)
+    _, sums, _ = _backward(scene, (*outputs, None), (plain, base, depths, weights, alpha, None), errors)
     assert sums is not None
     return sums
 
 
 class Walked(NamedTuple):
-    """What a walk along rays reads: records (N, 4, 4) and limits (N,) of the surfels, their lists, the image plane."""
+    """What a walk along rays reads: records (N, 4, 4) and limits (N,) of the surfels, their lists, the image plane.
+
+    `channels` (N, 16) are more channels of their colours, or None.
+    """
 
     records: torch.Tensor
     limits: torch.Tensor
     tiles: Tiles
     camera: Pinhole
+    channels: torch.Tensor | None = None
 
     @property
     def real(self) -> type:
@@ -128,7 +149,7 @@ class Walked(NamedTuple):
         records, limits, reaches = array(self.records, t.vec4), array(self.limits, t.real), array(tiles.reaches, t.vec2)
         lists = {name: array(getattr(tiles, name), wp.int32) for name in TileLists.vars}  # type: ignore[attr-defined]  # of a Warp struct
         return [
-            struct(t.Surfels, records=records, limits=limits, reaches=reaches),
+            struct(t.Surfels, records=records, limits=limits, reaches=reaches, channels=rows_of(self.channels)),
             struct(TileLists, **lists),
             view_of(camera, t.real, tiles.columns),
         ]
@@ -161,36 +182,43 @@ class SlotSums:
     add by atomics: in fixed point, if the order must not matter.
     """
 
-    def __init__(self, like: torch.Tensor, tiles: Tiles, *, with_errors: bool = False) -> None:
+    def __init__(
+        self, like: torch.Tensor, tiles: Tiles, *, with_errors: bool = False, with_channels: bool = False
+    ) -> None:
         self.like, self.tiles, self.exact = like, tiles, tiles.exact
         self.fixed_point = sums_in_fixed_point(like)
         count = len(tiles.entries) if tiles.exact else len(like)
         self.bad = torch.zeros(1, dtype=torch.int32, device=like.device) if self.fixed_point else None
         self.records = sums_like(like, (count, 4, 4), self.fixed_point)
         self.errors = sums_like(like, (count,), self.fixed_point) if with_errors else None
+        self.channels = sums_like(like, (count, 4, 4), self.fixed_point) if with_channels else None
 
     def argument(self) -> Argument:
         """The struct `Sums` of the kernels."""
         real = real_of(self.like)
-        errors = None
+        sums = (self.records, self.channels, self.errors)
         if self.fixed_point:
-            records = array(self.records.view(len(self.records), -1), wp.int64)
-            errors = array(self.errors, wp.int64)
+            pairs = (None if x is None else x.view(len(x), -1) for x in sums)
+            records, channels, errors = (array(x, wp.int64) for x in pairs)
         else:
-            records, errors = array(self.records, types(real).vec4), array(self.errors, real)
+            dtypes = (types(real).vec4, types(real).vec4, real)
+            records, channels, errors = (array(x, dtype) for x, dtype in zip(sums, dtypes, strict=True))
         return struct(
             gradient_types(real, self.fixed_point).Sums,
             slots=array(self.tiles.entries if self.exact else None, wp.int32),
             records=records,
             errors=errors,
             bad=array(self.bad, wp.int32),
+            channels=channels,
         )
 
-    def totals(self) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Sums of the records' gradients (N, 4, 4) and, where asked for, of errors (N,)."""
+    def totals(self) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
+        """Sums of the records' gradients (N, 4, 4) and, where asked for, of errors (N,) and channels' (N, 16)."""
         real = real_of(self.like)
         records = self._reduced(self.records, types(real).vec4)
-        return records, None if self.errors is None else self._reduced(self.errors[:, None], real)[:, 0]
+        errors = None if self.errors is None else self._reduced(self.errors[:, None], real)[:, 0]
+        channels = None if self.channels is None else self._reduced(self.channels, types(real).vec4).flatten(1)
+        return records, errors, channels
 
     def _reduced(self, slots: torch.Tensor, dtype: type) -> torch.Tensor:
         """Return each surfel's sum (N, columns, ...) of slots (slots, columns, ...), a column being a `dtype`."""
@@ -212,17 +240,23 @@ class _Context(Context):
 class _Collect(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: _Context, records: torch.Tensor, scene: Walked, max_hits: int, request: SplatErrorRequest
-    ) -> tuple[torch.Tensor, ...]:
+        ctx: _Context,
+        records: torch.Tensor,
+        channels: torch.Tensor | None,
+        scene: Walked,
+        max_hits: int,
+        request: SplatErrorRequest,
+    ) -> tuple[torch.Tensor | None, ...]:
         shape = (scene.camera.height, scene.camera.width)
         plain, base = (records.new_empty(*shape, 3) for _ in range(2))
         ids = torch.empty(*shape, max_hits, dtype=torch.int32, device=records.device)
         depths, weights = (records.new_empty(*shape, max_hits) for _ in range(2))
         alphas = records.new_empty(shape)
         stops = torch.empty(shape, dtype=torch.int32, device=records.device)
-        outputs = (plain, base, ids, depths, weights, alphas, stops)
-        scene.launch(collect_kernel(scene.real, max_hits), [hits_argument(scene.real, outputs)])
-        ctx.save_for_backward(*outputs)
+        more = None if channels is None else records.new_empty(*shape, CHANNELS)
+        outputs = (plain, base, ids, depths, weights, alphas, stops, more)
+        scene.launch(collect_kernel(scene.real, max_hits, more is not None), [hits_argument(scene.real, outputs)])
+        ctx.save_for_backward(*outputs)  # type: ignore[arg-type]  # torch takes None, too
         ctx.rest = (scene, request)
         ctx.mark_non_differentiable(ids, stops)
         return outputs
@@ -231,26 +265,27 @@ class _Collect(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: _Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         scene, request = ctx.rest
-        plain, base, _ids, depths, weights, alphas, _stops = grads
-        grad_records, errors = _backward(
-            scene, ctx.saved_tensors, (plain, base, depths, weights, alphas), request.errors
-        )
+        plain, base, _ids, depths, weights, alphas, _stops, more = grads
+        incoming = (plain, base, depths, weights, alphas, more)
+        grad_records, errors, grad_channels = _backward(scene, ctx.saved_tensors, incoming, request.errors)
         if errors is not None:
             request.sums_after_backward = errors
-        return grad_records, None, None, None
+        return grad_records, grad_channels, None, None, None
 
 
 def _backward(
     scene: Walked,
-    outputs: tuple[torch.Tensor, ...],
-    grads: tuple[torch.Tensor, ...],
+    outputs: tuple[torch.Tensor | None, ...],
+    grads: tuple[torch.Tensor | None, ...],
     errors: torch.Tensor | None,
-) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Gradients of the records (N, 4, 4), and sums of weight * error (N,) where there are errors (H, W)."""
-    real, max_hits = scene.real, outputs[2].shape[-1]
+) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
+    """Gradients of the records (N, 4, 4), sums of weight * error (N,) where there are errors, and of channels."""
+    real = scene.real
     t = types(real)
-    plain, base, depths, weights, alphas = (x.contiguous() for x in grads)
-    sums = SlotSums(scene.records, scene.tiles, with_errors=errors is not None)
+    plain, base, depths, weights, alphas, more = (None if x is None else x.contiguous() for x in grads)
+    assert plain is not None and base is not None and depths is not None and weights is not None and alphas is not None
+    max_hits, wide = depths.shape[-1], more is not None
+    sums = SlotSums(scene.records, scene.tiles, with_errors=errors is not None, with_channels=wide)
     incoming = struct(
         gradient_types(real).HitGradients,
         plain=array(plain.view(-1, 3), t.vec3),
@@ -259,16 +294,17 @@ def _backward(
         weights=_buffer_array(weights, real),
         alphas=array(alphas.view(-1), real),
         errors=array(None if errors is None else errors.view(-1), real),
+        channels=rows_of(more),
     )
-    kernel = collect_backward_kernel(real, max_hits, errors is not None, sums.fixed_point, scene.tiles.exact)
+    kernel = collect_backward_kernel(real, max_hits, errors is not None, sums.fixed_point, scene.tiles.exact, wide)
     scene.launch(kernel, [hits_argument(real, outputs), incoming, sums.argument()])
     return sums.totals()
 
 
 def hits_argument(real: type, outputs: tuple[torch.Tensor | None, ...]) -> Argument:
-    """The struct `Hits` of the kernels, of (plain, base, ids, depths, weights, alphas, stops)."""
+    """The struct `Hits` of the kernels, of (plain, base, ids, depths, weights, alphas, stops, channels)."""
     t = types(real)
-    *buffers, stops = outputs
+    *buffers, stops, channels = outputs
     plain, base, ids, depths, weights, alphas = (x for x in buffers if x is not None)
     return struct(
         t.Hits,
@@ -279,7 +315,13 @@ def hits_argument(real: type, outputs: tuple[torch.Tensor | None, ...]) -> Argum
         weights=_buffer_array(weights, real),
         alphas=array(alphas.view(-1), real),
         stops=array(None if stops is None else stops.view(-1), wp.int32),
+        channels=rows_of(channels),
     )
+
+
+def rows_of(channels: torch.Tensor | None) -> Argument:
+    """View channels (..., 16) as the kernels do, in four rows of four."""
+    return None if channels is None else array(channels.view(-1, 4, 4), types(real_of(channels)).vec4)
 
 
 def _buffer_array(buffer: torch.Tensor, dtype: type) -> Argument:

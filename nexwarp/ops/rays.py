@@ -185,7 +185,7 @@ def collect_rays(
         array(tiles.tile_offsets, wp.int64),
         array(rays.contiguous().view(-1, 3), t.vec3),
         struct(t.View, size=wp.vec2i(width, height), tile_columns=tiles.columns, near=near),
-        hits_argument(real, (plain, base, ids, depths, weights, alpha, None)),
+        hits_argument(real, (plain, base, ids, depths, weights, alpha, None, None)),
         surface_argument(real, (expected, median, top, normals)),
     ]
     launch_pixels(rays, collect_rays_kernel(real, max_hits), len(tiles.tile_offsets) - 1, arguments)
