@@ -21,6 +21,7 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
 from nexwarp.model.options import RenderOptions
+from nexwarp.model.rasterize import Hits, compose, rasterize
 from nexwarp.model.render import Rendering, render
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
@@ -36,6 +37,7 @@ __all__ = [
     "Config",
     "DetailLimits",
     "Exposures",
+    "Hits",
     "Model",
     "NeuralTexture",
     "RayCamera",
@@ -47,10 +49,12 @@ __all__ = [
     "Target",
     "Trainer",
     "View",
+    "compose",
     "load",
     "load_cameras",
     "load_scene",
     "preset",
+    "rasterize",
     "render",
     "train",
 ]

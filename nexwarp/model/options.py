@@ -93,30 +93,30 @@ def check_removed(values: dict[str, Any]) -> None:
         raise ValueError(f"sh_degree: expected at most 3, got {degree}: higher degrees were removed after 7f7bd6c")
 
 
-def color_tensor(background: Color, like: torch.Tensor) -> torch.Tensor:
-    """Return the background as a (3,) tensor; a tensor keeps its graph."""
+def color_tensor(background: Color, like: torch.Tensor, channels: int = 3) -> torch.Tensor:
+    """Return the background as a (channels,) tensor; a tensor keeps its graph."""
     if isinstance(background, torch.Tensor):
         if background.device.type == "cpu":
             check_finite("background", background.detach())
-        return background.expand(3) if background.ndim == 0 else background
-    values = color_numbers(background)
+        return background.expand(channels) if background.ndim == 0 else background
+    values = color_numbers(background, channels)
     for value in values:
         if not abs(value) <= torch.finfo(like.dtype).max:
             raise ValueError(f"background: expected finite values, got {value}")
     return torch.stack([like.new_full((), value) for value in values])
 
 
-def color_numbers(background: float | Sequence[float]) -> list[float]:
-    """Return a background that is no tensor as three numbers; raise TypeError or ValueError where it is none."""
+def color_numbers(background: float | Sequence[float], channels: int = 3) -> list[float]:
+    """Return a background that is no tensor as numbers; raise TypeError or ValueError where it is none."""
     values: Sequence[object]
     if isinstance(background, numbers.Real):
-        values = [background] * 3
+        values = [background] * channels
     elif isinstance(background, Iterable) and not isinstance(background, str):
         values = list(background)
     else:
         raise TypeError(f"background: expected numbers or a tensor, got {type(background).__name__}")
-    if len(values) != 3:
-        raise ValueError(f"background: expected 3 values, got {len(values)}")
+    if len(values) != channels:
+        raise ValueError(f"background: expected {channels} values, got {len(values)}")
     if not all(isinstance(x, numbers.Real) and not isinstance(x, bool) for x in values):
-        raise TypeError(f"background: expected three numbers or a tensor, got {values}")
+        raise TypeError(f"background: expected numbers or a tensor, got {values}")
     return cast(list[float], values)

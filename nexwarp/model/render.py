@@ -211,7 +211,7 @@ def draw(
     parallel rays by z-depth, whatever the options' order. A background of None is that of the options. `jitter`:
     (H, W, K) factors on the depths at which the texture is evaluated, see `jitter_factors`; for training.
     """
-    _check_device(surfels)
+    prepare_device("surfels", surfels.means)
     exposures = exposures if options.exposure == "photos" else None
     limits = limits if options.detail_limits and len(surfels) else None
     differentiable = torch.is_grad_enabled() and isinstance(camera, Camera)
@@ -226,7 +226,7 @@ def draw(
             if isinstance(camera, RayCamera):
                 hits: ops.Hits | RayHits = _ray_hits(shape, projection, camera, options)
             else:
-                pinhole = _pinhole(camera, shape.means)
+                pinhole = pinhole_of(camera, shape.means)
                 tiles = ops.intersect_tiles(shape, projection, camera.viewmat, pinhole, blending=options.order)
                 hits = ops.collect(projection, tiles, pinhole, max_hits=options.max_hits)
             texels = None if texture is None else _texels(texture, camera, hits, options, limits, jitter)
@@ -243,24 +243,29 @@ def draw(
             stages = Intermediates(projection, hits, texels, residual, factors, tiles, pinhole, camera.viewmat)
             return Rendering(*buffers, stages)
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, OutOfMemoryError) or (needed := needed_memory(error)) is None:
-            raise
+        refusal = memory_error(error, camera, options.max_hits)
     # Outside of the handler: the error's traceback would keep alive what has been allocated.
-    task = f"an image of {camera.width}x{camera.height} pixels with K = {options.max_hits}"
-    raise OutOfMemoryError.of(task, needed)
+    raise refusal
 
 
-def _check_device(surfels: Surfels) -> None:
-    """Check the surfels' dtype and device, and get the device ready."""
-    dtype, device = surfels.means.dtype, surfels.device
+def memory_error(error: MemoryError | RuntimeError, camera: Camera | RayCamera, max_hits: int) -> OutOfMemoryError:
+    """Return the error of a rendering that lacked memory; raise one of another kind again."""
+    if isinstance(error, OutOfMemoryError) or (needed := needed_memory(error)) is None:
+        raise error
+    return OutOfMemoryError.of(f"an image of {camera.width}x{camera.height} pixels with K = {max_hits}", needed)
+
+
+def prepare_device(name: str, means: torch.Tensor) -> None:
+    """Check the dtype and device of an argument's surfels, and get the device ready."""
+    dtype, device = means.dtype, means.device
     if dtype not in (torch.float32, torch.float64):
-        raise TypeError(f"surfels: expected float32 or float64 parameters, got {dtype}")
+        raise TypeError(f"{name}: expected float32 or float64 values, got {dtype}")
     if device.type == "cuda":
         torch.cuda.init()  # in a process forked from one that used CUDA, torch's own error says so
     elif device.type == "cpu":
         keep_freed_memory()
     else:
-        raise ValueError(f"surfels: expected parameters on a CPU or a CUDA device, got {device}")
+        raise ValueError(f"{name}: expected values on a CPU or a CUDA device, got {device}")
 
 
 def _check(
@@ -276,10 +281,8 @@ def _check(
     dtype, device = surfels.means.dtype, surfels.device
     if options.clamp_texture and texture is not None and texture.residual:
         raise ValueError("clamp_texture: expected False with a residual texture, got True")
-    expected: dict[str, tuple[torch.Tensor, tuple[int, ...]]] = {
-        "camera.viewmat": (camera.viewmat, (4, 4)),
-        "background": (background, (3,)),
-    }
+    check_camera(camera, surfels.means)
+    expected: dict[str, tuple[torch.Tensor, tuple[int, ...]]] = {"background": (background, (3,))}
     if isinstance(camera, RayCamera):
         expected["camera.rays"] = (camera.rays, (camera.height, camera.width, 3))
     if texture is not None:
@@ -290,10 +293,19 @@ def _check(
         expected["detail_limits.nearest"] = (limits.nearest, (len(surfels),))
         expected["detail_limits.farthest"] = (limits.farthest, (len(surfels),))
     check_tensors(expected, dtype=dtype, device=device)
-    if isinstance(camera, Camera) and camera.K.device != device:  # of any dtype
-        raise ValueError(f"camera.K: expected a tensor on {device}, got one on {camera.K.device}")
     stored = (0, dtype) if texture is None else texture.stored_per_point(options.sh_degree)
     ops.check_image(camera.width, camera.height, options.max_hits, dtype, device, texture=stored)
+
+
+def check_camera(camera: Camera | RayCamera, like: torch.Tensor) -> None:
+    """Check a camera's tensors: intrinsics may have any dtype, but no gradient."""
+    check_tensors({"camera.viewmat": (camera.viewmat, (4, 4))}, dtype=like.dtype, device=like.device)
+    if isinstance(camera, RayCamera):
+        return
+    if camera.K.device != like.device:
+        raise ValueError(f"camera.K: expected a tensor on {like.device}, got one on {camera.K.device}")
+    if camera.K.requires_grad and torch.is_grad_enabled():
+        raise ValueError("camera.K: expected requires_grad=False: renderings have no gradient of the intrinsics")
 
 
 def antialiased(shape: Activated, camera: Camera | RayCamera, limits: DetailLimits | None) -> Activated:
@@ -324,7 +336,8 @@ def _eye(means: torch.Tensor, camera: Camera | RayCamera) -> torch.Tensor:
     return position - FAR_AWAY * extent * camera.viewmat[2, :3]
 
 
-def _pinhole(camera: Camera, like: torch.Tensor) -> ops.Pinhole:
+def pinhole_of(camera: Camera, like: torch.Tensor) -> ops.Pinhole:
+    """Return the camera's image plane, as the ops take it."""
     return ops.Pinhole(camera.K.to(like), camera.width, camera.height, camera.near)
 
 
@@ -364,7 +377,7 @@ def _texels(
     if isinstance(camera, RayCamera):
         positions, directions = _unproject_rays(shifted, camera)
     else:
-        positions, directions = ops.unproject(shifted, camera.viewmat, _pinhole(camera, shifted))
+        positions, directions = ops.unproject(shifted, camera.viewmat, pinhole_of(camera, shifted))
     depths = hits.depths
     if isinstance(camera, RayCamera) and camera.parallel:  # empty slots keep 0, which the texture passes over
         depths = (hits.weights > 0).to(hits.depths)

@@ -266,7 +266,7 @@ def test_tensors_on_the_meta_device_are_named():
     surfels, texture, camera = parts()
     with pytest.raises(ValueError, match=r"^camera\.K: expected a tensor on cpu, got one on meta$"):
         nw.render(surfels, texture, moved(camera, camera.K.to("meta")))
-    with pytest.raises(ValueError, match=r"^surfels: expected parameters on a CPU or a CUDA device, got meta$"):
+    with pytest.raises(ValueError, match=r"^surfels: expected values on a CPU or a CUDA device, got meta$"):
         nw.render(surfels.to("meta"), texture, camera)
 
 

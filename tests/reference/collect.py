@@ -38,8 +38,8 @@ class Hits:
     """What the collection pass leaves in each pixel.
 
     Attributes:
-        plain: (H, W, 3) blended colour of the hits that are not in the buffer.
-        base: (H, W, 3) blended colour of those that are.
+        plain: (H, W, D) blended colour of the hits that are not in the buffer.
+        base: (H, W, D) blended colour of those that are.
         ids: (H, W, K) int64, surfels in the buffer, heaviest first, -1 where empty.
         depths: (H, W, K) z-depths of the hits, 0 where empty.
         weights: (H, W, K) blending weights, 0 where empty.
@@ -132,7 +132,7 @@ def intersect(
 
 
 def collect(shape: Shape, colors: torch.Tensor, viewmat: torch.Tensor, view: View, max_hits: int) -> Hits:
-    """Blend plain colours (N, 3) in every pixel of a camera (4, 4), world to camera; differentiable in every tensor."""
+    """Blend colours (N, D) in every pixel of a camera (4, 4), world to camera; differentiable in every tensor."""
     walked = walk(shape, viewmat, view)
     ranked, t, alphas = walked.order, walked.t, walked.alphas
     weights = alphas * walked.before
@@ -151,8 +151,8 @@ def collect(shape: Shape, colors: torch.Tensor, viewmat: torch.Tensor, view: Vie
         return values.reshape(view.height, view.width, max_hits)
 
     return Hits(
-        plain=plain.reshape(view.height, view.width, 3),
-        base=base.reshape(view.height, view.width, 3),
+        plain=plain.reshape(view.height, view.width, -1),
+        base=base.reshape(view.height, view.width, -1),
         ids=slots(ranked[heaviest], -1),
         depths=slots(t.gather(-1, heaviest), 0.0),
         weights=slots(weights.gather(-1, heaviest), 0.0),
