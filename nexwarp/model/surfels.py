@@ -73,7 +73,7 @@ class Surfels(nn.Module):
         gammas: torch.Tensor,
         sh: torch.Tensor,
     ) -> "Surfels":
-        """Make surfels with new leaf parameters from activated values.
+        """Make surfels with new leaf parameters from activated values; `rasterize` keeps the graph of tensors.
 
         Args:
             means: (N, 3) centres, world units.
@@ -84,7 +84,8 @@ class Surfels(nn.Module):
             sh: (N, C, 3) spherical harmonics of the plain colour, DC first; C = (d + 1)^2, d of 0 to 3.
 
         Raises:
-            TypeError, ValueError: a type, shape, device or value does not fit; the message names the argument.
+            TypeError, ValueError: a type, shape, device or value does not fit, or a tensor has a graph, which the new
+                parameters would cut; the message names the argument.
         """
         arguments = {
             "means": (means, ("N", 3)),
@@ -99,6 +100,11 @@ class Surfels(nn.Module):
             raise TypeError(f"means: expected float32 or float64, got {means.dtype}")
         check_coefficients("sh", sh.shape[1])
         for name, (tensor, _) in arguments.items():
+            if tensor.grad_fn is not None and torch.is_grad_enabled():
+                raise ValueError(
+                    f"{name}: expected a tensor without a graph, got one of {type(tensor.grad_fn).__name__}; "
+                    "nexwarp.rasterize keeps the graph, detach() leaves it"
+                )
             check_finite(name, tensor)
         largest = quats.abs().amax(dim=-1, keepdim=True)
         _check_each("quats", largest[..., 0] > 0, quats, "a length > 0")

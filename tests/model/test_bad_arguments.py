@@ -113,6 +113,7 @@ BAD_SURFELS = [
     ("sh", ValueError, lambda sh: sh[..., :2]),
     ("sh", ValueError, lambda sh: changed(sh, (7, 15, 2), float("nan"))),
     ("sh", TypeError, lambda sh: sh.half()),
+    ("means", ValueError, lambda means: means + torch.zeros(3, requires_grad=True)),  # its graph would be cut
 ]
 
 
