@@ -139,7 +139,7 @@ def project(view, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def color_error(scene, origin: Sequence[float] = (0.0, 0.0, 0.0), paint: Callable = paint) -> float:
-    """Return the largest mean difference of a view, of 255, between photos and the room's colours at points of its walls.
+    """Largest mean difference of a view, of 255, between its photo and the room's colours at points of its walls.
 
     `origin` is the room's point at the origin of the scene's cameras.
     """
