@@ -15,7 +15,6 @@ from nexwarp.cli.display import describe_exposures, device_name
 from nexwarp.cli.eval import figures
 from nexwarp.cli.options import Device_, Flag_, Preset_, Run_, check_max_hits, option
 from nexwarp.data.sfm import SfmOptions, reconstruct
-from nexwarp.model.detail import check_detail
 from nexwarp.run import warmup
 from nexwarp.run.export import ExportOrder, export_run
 from nexwarp.run.folder import RENDERS_FOLDER, read_metrics
@@ -35,18 +34,15 @@ class Render:
     run: Run_
     """Run folder, or a model's folder or .safetensors file."""
     pictures: tyro.conf.OmitArgPrefixes[RenderOrder] = dataclasses.field(default_factory=RenderOrder)
-    detail: Annotated[float, option("SHARE")] = 1.0
-    """Share of the surfels to render with, above 0 to 1 (docs/detail.md)."""
     device: Device_ = None
     """Device to render on."""
 
     def __call__(self, console: Console) -> None:
         """Render."""
         device = pick_device(self.device)
-        check_detail("--detail", self.detail)
         self.pictures.check()
         opened = open_model(self.run)
-        model = opened.model_at(self.detail, device)
+        model = opened.model.to(device)
         job = self.pictures.prepare(opened)
         with display.counting(console, "rendering", len(job)) as done:
             job.render(model, done)

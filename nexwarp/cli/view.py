@@ -3,13 +3,12 @@
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
 from nexwarp.cli.device import pick_device
-from nexwarp.cli.options import Device_, Host_, Port_, Run_, option
-from nexwarp.model.detail import check_detail
+from nexwarp.cli.options import Device_, Host_, Port_, Run_
 from nexwarp.run.folder import keep_camera_path
 from nexwarp.run.opened import near_depth, open_model
 
@@ -27,8 +26,6 @@ class ViewCommand:
     """Address to listen on; 0.0.0.0 allows other machines, with the token of the URL that is printed."""
     port: Port_ = 8080
     """Port to listen on; 0 picks a free one."""
-    detail: Annotated[float, option("SHARE")] = 1.0
-    """Share of the surfels to show, above 0 to 1, as of nexwarp render."""
     device: Device_ = None
     """Device to render on."""
 
@@ -36,9 +33,8 @@ class ViewCommand:
         """Serve the viewer until Ctrl-C."""
         from nexwarp.viewer import Viewer, ViewerOptions
 
-        check_detail("--detail", self.detail)
         opened = open_model(self.run)
-        model = opened.model_at(self.detail, pick_device(self.device))
+        model = opened.model.to(pick_device(self.device))
         with Viewer(
             lambda: model,
             opened.cameras,

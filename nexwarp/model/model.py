@@ -33,8 +33,7 @@ class Model(nn.Module):
         detail_limits: detail limits of the N surfels; None limits nothing.
         options: the options of its rendering.
         meta: further facts, as JSON values: `near` [world units], `scene_scale` [world units], `preset`, `iteration`;
-            a finished model also has `smooth_sh`, and `ordered` where surfels are in the order of their share of the
-            training pictures, largest first (see `at_detail`).
+            a finished model also has `smooth_sh`.
 
     Raises:
         TypeError, ValueError: the message names the argument.
@@ -154,20 +153,6 @@ class Model(nn.Module):
             changes: fields of `RenderOptions` to change.
         """
         return Model(self.surfels, None, options=self.options.changed(**changes), meta=self.meta)
-
-    def at_detail(self, detail: float) -> "Model":
-        """Return a coarser model with parameters of its own, for slow devices and quick looks.
-
-        Args:
-            detail: share of the surfels, 0.0001 to 1: those that make up most of the training pictures. The texture
-                keeps its coarse levels, all of them from a detail of 0.5 on.
-
-        Raises:
-            ValueError: a detail out of range, or the surfels are not in the order of their share of the pictures.
-        """
-        from nexwarp.model.detail import at_detail
-
-        return at_detail(self, detail)
 
     def save(self, path: str | os.PathLike[str], *, compact: bool = False) -> Path:
         """Write the model; `nexwarp.load` reads it.

@@ -16,7 +16,6 @@ from nexwarp.io.safetensors_files import check_tensors_header
 from nexwarp.model.bounds import check_bounds, fits_half
 from nexwarp.model.compact import CODE_NAMES, STORED, decode, encode
 from nexwarp.model.compact import DTYPES as COMPACT_DTYPES
-from nexwarp.model.detail import ORDERED, check_detail
 from nexwarp.model.detail_limits import NEVER, DetailLimits
 from nexwarp.model.exposures import SHAPES, Exposures
 from nexwarp.model.model import Model
@@ -73,12 +72,11 @@ def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = Fa
     return file
 
 
-def load(path: str | os.PathLike[str], *, detail: float = 1.0) -> Model:
+def load(path: str | os.PathLike[str]) -> Model:
     """Load a model onto the CPU. The scene's photos are not needed.
 
     Args:
         path: a run folder or a model file.
-        detail: keep the first surfels and coarse texture levels only, as `Model.at_detail` describes.
 
     Raises:
         FileNotFoundError: the folder or the file does not exist.
@@ -89,7 +87,6 @@ def load(path: str | os.PathLike[str], *, detail: float = 1.0) -> Model:
 
     if not isinstance(path, (str, os.PathLike)):
         raise TypeError(f"path: expected a path, got {type(path).__name__}")
-    check_detail("detail", detail)
     path = Path(path)
     if path.is_dir():
         path = path / MODEL_FILE
@@ -108,18 +105,13 @@ def load(path: str | os.PathLike[str], *, detail: float = 1.0) -> Model:
             kinds = {name: (file.get_slice(name).get_dtype(), file.get_slice(name).get_shape()) for name in names}
             _check_kinds(kinds, texture_shapes, compact)
             tensors = {name: file.get_tensor(name) for name in names}
-        model = _make_model(decode(tensors) if compact else tensors, options, shape, meta)
+        return _make_model(decode(tensors) if compact else tensors, options, shape, meta)
     except FormatError:
         raise
     except (SafetensorError, OSError) as error:
         raise FormatError(f"{path}: expected a safetensors file, but it cannot be read ({one_line(error)})") from None
     except (KeyError, TypeError, ValueError, RuntimeError, MemoryError, OverflowError) as error:
         raise FormatError(f"{path}: expected the tensors of a nexwarp model ({one_line(error)})") from None
-    if detail == 1.0:
-        return model
-    if model.meta.get(ORDERED) is not True:
-        raise FormatError(f"{path}: expected surfels in the order of their share of the pictures, for a detail")
-    return model.at_detail(detail)
 
 
 def _read_metadata(path: Path, text: str | None) -> dict[str, Json]:

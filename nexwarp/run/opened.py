@@ -4,18 +4,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import torch
-
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.paths import surrounding
 from nexwarp.data.scene import SceneSource
-from nexwarp.errors import FormatError, MissingError
-from nexwarp.model.detail import ORDERED
+from nexwarp.errors import MissingError
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load
 from nexwarp.run.folder import CONFIG_FILE, read_run
-from nexwarp.train.finish.finish import ordered
 from nexwarp.train.recipe import Config
 
 
@@ -38,22 +34,6 @@ class OpenedModel:
     def model(self) -> Model:
         """The model, on the CPU."""
         return load(self.file)
-
-    def model_at(self, detail: float, device: torch.device) -> Model:
-        """Return the model on a device, at a detail as `Model.at_detail` describes it.
-
-        Models of older versions, with surfels in no order, are ordered by their share of the cameras' pictures.
-        """
-        if detail == 1.0:
-            return self.model.to(device)
-        try:
-            return load(self.file, detail=detail).to(device)
-        except FormatError:
-            whole = self.model.to(device)  # names a damaged file
-            cameras = [camera.to(device) for members in self.cameras.values() for camera in members.values()]
-            if whole.meta.get(ORDERED) is True or not cameras:
-                raise
-            return ordered(whole, cameras).at_detail(detail)
 
     @cached_property
     def cameras(self) -> dict[str, dict[str, Camera]]:

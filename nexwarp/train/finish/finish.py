@@ -1,16 +1,13 @@
 """Turns trained surfels into a finished model."""
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import TypeVar
 
-import torch
-
-from nexwarp.cameras.camera import Camera, reduced
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import View
 from nexwarp.machine import deterministic
-from nexwarp.model.detail import ORDERED, pick_surfels
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
@@ -21,7 +18,6 @@ from nexwarp.train.views import with_cameras
 
 FinishObserver = Callable[[str, int, int], None]
 Item = TypeVar("Item")
-HEIGHT = 540  # pixels of the pictures that shares are measured in, at most
 
 
 def finish_model(
@@ -34,9 +30,8 @@ def finish_model(
 ) -> Model:
     """Return a finished model with surfels of its own: smooth SH, detail limits and exposures.
 
-    The surfels are ordered by their share of the training pictures, largest first. The texture is shared. `cameras`
-    are those of the training views as their poses are corrected, on the model's device. `observe` is called with each
-    stage's name, how many views of it are rendered, and of how many.
+    The texture is shared. `cameras` are those of the training views as their poses are corrected, on the model's
+    device. `observe` is called with each stage's name, how many views of it are rendered, and of how many.
     """
     raw = {name: value.detach().clone() for name, value in model.surfels.state_dict().items()}
     finished = Model(Surfels(raw), model.texture, options=model.options)
@@ -52,8 +47,7 @@ def finish_model(
     if exposures is not None:
         finished.exposures = copy.deepcopy(exposures).to(model.device)
     finished.meta = model.meta | {"smooth_sh": config.smooth_sh}
-    with deterministic(config.deterministic and model.device.type == "cuda"):
-        return ordered(finished, counted(cameras, "ordering surfels", observe))
+    return finished
 
 
 def counted(items: Sequence[Item], stage: str, observe: FinishObserver) -> Iterator[Item]:
@@ -61,24 +55,3 @@ def counted(items: Sequence[Item], stage: str, observe: FinishObserver) -> Itera
     for done, item in enumerate(items, 1):
         yield item
         observe(stage, done, len(items))
-
-
-@torch.no_grad()
-def picture_shares(model: Model, cameras: Iterable[Camera]) -> torch.Tensor:
-    """Return the sums (N,) of each surfel's blending weights over all pictures, each by its mean over the pixels."""
-    bare = model.bare()
-    shares = torch.zeros_like(model.surfels.logit_opacities)
-    for camera in cameras:
-        out = bare.render(reduced(camera, HEIGHT))
-        shares += out.splat_error(torch.full_like(out.alpha, 1.0 / out.alpha.numel()))
-    return shares
-
-
-def ordered(model: Model, cameras: Iterable[Camera]) -> Model:
-    """Return a model with the same surfels, those of the largest shares of the cameras' pictures first."""
-    if not len(model.surfels):
-        return model
-    shares = picture_shares(model, cameras)
-    result = pick_surfels(model, shares.argsort(descending=True, stable=True))
-    result.meta[ORDERED] = True
-    return result
