@@ -1,7 +1,7 @@
 """How `nexwarp train` runs the stages of a training: display, log, checkpoints, and the files of finished models."""
 
 import dataclasses
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -63,16 +63,16 @@ class Session(StageStore):
         ranks: Ranks,
         *,
         resume: bool = False,
-        sinks: Collection[str] = (),
+        tensorboard: bool = False,
         every: int | None = None,
     ) -> None:
-        """Note what to do; the student also logs to `sinks`; `every` None saves ten checkpoints a stage."""
+        """Note what to do; the student also logs to TensorBoard; `every` None saves ten checkpoints a stage."""
         self.run = run
         self.record = record
         self.console = console
         self.ranks = ranks
         self.resume = resume
-        self.sinks = sinks
+        self.tensorboard = tensorboard
         self.every = every
         self.viewer: Viewer | None = None
         self.seconds = 0.0
@@ -118,8 +118,7 @@ class Session(StageStore):
         total = stage.config.iterations
         every = self.every or max(total // CHECKPOINTS_A_RUN, 1)
         bar = display.TrainingDisplay(self.console, total, trainer.iteration, trainer.device, stage.name)
-        sinks = () if stage.teacher else self.sinks
-        log = TrainingLog(folder, trainer, sinks, self.record.config)
+        log = TrainingLog(folder, trainer, tensorboard=self.tensorboard and not stage.teacher)
         with ExitStack() as stack:
             if self.ranks.first:
                 stack.enter_context(bar)

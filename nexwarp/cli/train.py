@@ -32,7 +32,7 @@ from nexwarp.run.folder import (
     read_run,
     update_run,
 )
-from nexwarp.run.log import PACKAGES, check_package
+from nexwarp.run.log import check_tensorboard
 from nexwarp.train.ranks.launch import check_count, is_rank
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import DEMO_SETTINGS, Config, preset
@@ -92,8 +92,6 @@ class Train:
     """Port of --view; 0 picks one."""
     tensorboard: Flag_ = False
     """Also log to RUN/tensorboard (extra tensorboard)."""
-    wandb: Flag_ = False
-    """Also log to Weights & Biases (extra wandb)."""
 
     def __call__(self, console: Console) -> None:
         """Train."""
@@ -121,7 +119,7 @@ class Train:
                 own = NO_TEACHERS if teachers else plan_teachers(config, len(scene.train))
                 record = dataclasses.replace(record, config=config, own=own)
             session = Session(
-                run, record, console, ranks, resume=resume, sinks=self._sinks(), every=self.checkpoint_every
+                run, record, console, ranks, resume=resume, tensorboard=self.tensorboard, every=self.checkpoint_every
             )
             runner = stage_runner(
                 scene, record.config, ranks.device, session, own=record.own, ranks=ranks, teachers=teachers
@@ -240,16 +238,12 @@ class Train:
             raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
         if self.scene.downscale < 1:
             raise SettingError(f"--downscale: expected at least 1, got {self.scene.downscale}")
-        for name in self._sinks():
-            check_package(name)
+        if self.tensorboard:
+            check_tensorboard()
         if self.view:
             from nexwarp.viewer import check_server
 
             check_server(self.host, self.port)
-
-    def _sinks(self) -> list[str]:
-        """Return where to log beside the run's file."""
-        return [name for name in PACKAGES if getattr(self, name)]
 
     def _with_background(self, config: Config, scene: Scene) -> Config:
         """Return a config with the background of the scene's photos."""

@@ -46,7 +46,7 @@ METRICS_FILE = "metrics.json"
 LOG_FILE = "metrics.jsonl"
 DIVERGED_FILE = "diverged.json"  # of versions up to 0.2
 LOCK_FILE = "run.lock"
-WANDB_FILE = "wandb.json"  # the id of the run at Weights & Biases
+WANDB_FILE = "wandb.json"  # of versions up to 0.2
 CAMERA_PATH = "camera_path_{}.json"
 ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIVERGED_FILE, LOCK_FILE, WANDB_FILE)
 

@@ -1,4 +1,4 @@
-"""Training logs: lines of JSON at regular iterations and, on request, TensorBoard and Weights & Biases."""
+"""Training logs: lines of JSON at regular iterations and, on request, TensorBoard."""
 
 import importlib.util
 import json
@@ -6,25 +6,22 @@ import math
 import os
 import re
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TextIO
 
 import torch
 
 from nexwarp.errors import SettingError
-from nexwarp.io.files import one_line, written_aside
-from nexwarp.io.json_files import READ_ERRORS, Json, read_object, write_json
-from nexwarp.run.folder import LOG_FILE, TENSORBOARD_FOLDER, WANDB_FILE
-from nexwarp.train.recipe import Config
+from nexwarp.io.files import written_aside
+from nexwarp.io.json_files import Json
+from nexwarp.run.folder import LOG_FILE, TENSORBOARD_FOLDER
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 
 # Iterations between two lines, fewer in short runs, which get about MIN_LINES lines.
 EVERY = 100
 MIN_LINES = 100
-PACKAGES = ("tensorboard", "wandb")  # options, extras and packages have the same names
-WANDB_PROJECT = "nexwarp"  # unless the variable WANDB_PROJECT names one
 
 
 class TrainingLog:
@@ -34,32 +31,23 @@ class TrainingLog:
     nothing is fetched from the device. Values that are not finite are written as null.
     """
 
-    def __init__(
-        self, run: Path, trainer: Trainer, sinks: Collection[str] = (), settings: Config | None = None
-    ) -> None:
-        """Continue the log of a run folder: lines after the trainer's iteration, and damaged lines, are dropped.
-
-        `sinks` names `PACKAGES` that log, too; Weights & Biases gets `settings`, by default those of the trainer.
-        """
+    def __init__(self, run: Path, trainer: Trainer, *, tensorboard: bool = False) -> None:
+        """Continue the log of a run folder: lines after the trainer's iteration, and damaged lines, are dropped."""
         self.path = run / LOG_FILE
         self.trainer = trainer
-        self.sink_names = sinks
-        self.settings = trainer.config if settings is None else settings
+        self.tensorboard = tensorboard
         self.every = max(min(EVERY, trainer.config.iterations // MIN_LINES), 1)
         self.file: TextIO | None = None
-        self.sinks: list[TensorboardSink | WandbSink] = []
+        self.events: TensorboardEvents | None = None
 
     def __enter__(self) -> "TrainingLog":
-        run = self.path.parent
-        if "tensorboard" in self.sink_names:
-            self.sinks.append(TensorboardSink(run, self.trainer.iteration))
-        if "wandb" in self.sink_names:
-            self.sinks.append(WandbSink(run, self.settings.as_dict()))
+        if self.tensorboard:
+            self.events = TensorboardEvents(self.path.parent, self.trainer.iteration)
         self._open()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        for file in (self.file, *self.sinks):
+        for file in (self.file, self.events):
             try:
                 if file is not None:
                     file.close()
@@ -88,8 +76,8 @@ class TrainingLog:
         line = self._line(step)
         self.file.write(json.dumps(line, allow_nan=False) + "\n")
         self.file.flush()
-        for sink in self.sinks:
-            sink.write(_scalars(line), step.iteration)
+        if self.events is not None:
+            self.events.write(_scalars(line), step.iteration)
 
     def _line(self, step: StepReport) -> dict[str, Json]:
         # One transfer for all terms. It waits for the step, so the clock is read after it.
@@ -160,7 +148,7 @@ def _finite(value: float) -> float | None:
 
 
 def _scalars(line: Mapping[str, Json]) -> dict[str, float]:
-    """Return a line as the values that the sinks take, by name."""
+    """Return a line as TensorBoard's values, by name."""
     tags = {"loss/total": line["loss"], "train/psnr": line["psnr"], "train/surfels": line["surfels"]}
     tags["speed/iterations_per_second"] = line["iterations_per_second"]
     for group, values in (("loss", line["losses"]), ("rate", line["rates"])):
@@ -171,13 +159,15 @@ def _scalars(line: Mapping[str, Json]) -> dict[str, float]:
     return {name: value for name, value in tags.items() if isinstance(value, (int, float))}
 
 
-def check_package(name: str) -> None:
-    """Raise SettingError unless the package of an option is installed."""
-    if importlib.util.find_spec(name) is None:
-        raise SettingError(f"--{name}: expected the package {name}, found none; pip install 'nexwarp[{name}]'")
+def check_tensorboard() -> None:
+    """Raise SettingError unless the package of `--tensorboard` is installed."""
+    if importlib.util.find_spec("tensorboard") is None:
+        raise SettingError(
+            "--tensorboard: expected the package tensorboard, found none; pip install 'nexwarp[tensorboard]'"
+        )
 
 
-class TensorboardSink:
+class TensorboardEvents:
     """Writes events to a run's folder `tensorboard`; events after `iteration`, which are trained again, are hidden."""
 
     def __init__(self, run: Path, iteration: int) -> None:
@@ -193,32 +183,3 @@ class TensorboardSink:
         for name, value in scalars.items():
             self.writer.add_scalar(name, value, iteration)
         self.writer.flush()
-
-
-class WandbSink:
-    """Logs to Weights & Biases; a run that is resumed goes on there, by the id in its `wandb.json`."""
-
-    def __init__(self, run: Path, config: dict[str, Json]) -> None:
-        """Start or continue; SettingError if wandb cannot, for example without a login."""
-        import wandb
-
-        project = os.environ.get("WANDB_PROJECT", WANDB_PROJECT)
-        try:
-            known = read_object(run / WANDB_FILE).get("id")
-        except READ_ERRORS:
-            known = None
-        known = known if isinstance(known, str) else None
-        try:
-            self.run: wandb.Run = wandb.init(
-                project=project, name=run.resolve().name, config=config, id=known, resume="allow"
-            )
-            # Iterations that are trained again, after a resumption or a divergence, are logged again.
-            self.run.define_metric("*", step_metric="iteration")
-        except (wandb.errors.Error, OSError, ValueError) as error:
-            raise SettingError(f"--wandb: wandb cannot start: {one_line(error)}") from None
-        write_json(run / WANDB_FILE, {"id": self.run.id})
-        self.close = self.run.finish
-
-    def write(self, scalars: Mapping[str, float], iteration: int) -> None:
-        """Log values by name."""
-        self.run.log({"iteration": iteration, **scalars})

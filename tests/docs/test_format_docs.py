@@ -73,7 +73,7 @@ def flat(data: dict[str, Any], *parts: str) -> set[str]:
 
 def test_files(run):
     listed = named((DOCS / "format.md").read_text(encoding="utf-8").split("\n## ", 1)[0])
-    optional = {"tensorboard/", "camera_path_N.json", "export/", "wandb.json", "teachers/N/"}
+    optional = {"tensorboard/", "camera_path_N.json", "export/", "teachers/N/"}
     assert {f.name + "/" * f.is_dir() for f in run.iterdir()} == set(listed) - optional
     assert {f.name for f in (run / "checkpoint").iterdir()} == set(named(section("checkpoint/")))
     assert {f.name for f in (run / "renders").iterdir()} == {"test", "compare"}

@@ -18,7 +18,7 @@ else:
 
 ROOT = Path(__file__).parents[2]
 LOCKS = ("torch", "run", "dev")
-RUN_EXTRAS = ("viewer", "video", "tensorboard", "wandb", "flip", "glb", "splats")
+RUN_EXTRAS = ("viewer", "video", "tensorboard", "flip", "glb", "splats")
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 PLATFORMS = (
     {"sys_platform": "linux", "platform_machine": "x86_64"},

@@ -4,9 +4,7 @@ import dataclasses
 import importlib.util
 import json
 import math
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -173,7 +171,7 @@ def test_tensorboard_shows_the_lines(scene, tmp_path):
     """The same values under the same steps, also after a run was resumed from an earlier iteration."""
     pytest.importorskip("tensorboard", reason="tensorboard is not installed (pip install 'nexwarp[tensorboard]')")
     trainer = Trainer(scene, CONFIG, "cpu")
-    with TrainingLog(tmp_path, trainer, ("tensorboard",)) as log:
+    with TrainingLog(tmp_path, trainer, tensorboard=True) as log:
         for _ in range(8):
             log(trainer.step())
             if trainer.iteration == 5:
@@ -181,7 +179,7 @@ def test_tensorboard_shows_the_lines(scene, tmp_path):
     assert max(events(tmp_path)["loss/total"]) == 8
     trainer = Trainer(scene, CONFIG, "cpu")
     trainer.restore(tmp_path)
-    with TrainingLog(tmp_path, trainer, ("tensorboard",)) as log:
+    with TrainingLog(tmp_path, trainer, tensorboard=True) as log:
         trainer.run(log)
     shown, written = events(tmp_path), lines(tmp_path)
     steps = {line["iteration"]: line for line in written}
@@ -199,54 +197,11 @@ def test_tensorboard_shows_the_lines(scene, tmp_path):
     assert {f"loss/{name}" for name in terms | {"total"}} == {tag for tag in shown if tag.startswith("loss/")}
 
 
-@pytest.mark.parametrize("package", ["tensorboard", "wandb"])
-def test_a_missing_package_is_one_line(tmp_path, capsys, monkeypatch, package):
+def test_a_missing_package_is_one_line(tmp_path, capsys, monkeypatch):
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == package else find(name, *a))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "tensorboard" else find(name, *a))
     run = tmp_path / "runs" / "new"
-    assert cli.main(["train", "demo", "--run", str(run), "--device", "cpu", f"--{package}"]) == 2
+    assert cli.main(["train", "demo", "--run", str(run), "--device", "cpu", "--tensorboard"]) == 2
     err = capsys.readouterr().err
-    assert f"--{package}" in err and f"pip install 'nexwarp[{package}]'" in err and err.count("\n") == 1
+    assert "--tensorboard" in err and "pip install 'nexwarp[tensorboard]'" in err and err.count("\n") == 1
     assert not run.parent.exists()
-
-
-# Weights & Biases
-
-
-class WandbStub:
-    """What nexwarp uses of the package, without its server."""
-
-    def __init__(self):
-        self.started, self.logged, self.finished = [], [], 0
-        self.id, self.errors = "abc", SimpleNamespace(Error=RuntimeError)
-
-    def init(self, **settings):
-        self.started.append(settings)
-        return self
-
-    def define_metric(self, name, step_metric):
-        assert (name, step_metric) == ("*", "iteration")
-
-    def log(self, values):
-        self.logged.append(values)
-
-    def finish(self):
-        self.finished += 1
-
-
-def test_wandb_gets_the_names_and_values_of_tensorboard(scene, tmp_path, monkeypatch):
-    pytest.importorskip("tensorboard", reason="tensorboard is not installed (pip install 'nexwarp[tensorboard]')")
-    stub = WandbStub()
-    monkeypatch.setitem(sys.modules, "wandb", stub)
-    for _ in range(2):  # the second time as a resumed run
-        with TrainingLog(tmp_path, trainer := Trainer(scene, CONFIG, "cpu"), ("tensorboard", "wandb")) as log:
-            log(trainer.step())
-    shown, (values, again) = events(tmp_path), stub.logged
-    assert values.keys() == again.keys() == shown.keys() | {"iteration"}
-    for name, steps in shown.items():
-        assert again[name] == pytest.approx(steps[1], rel=1e-6), name
-    assert [start["id"] for start in stub.started] == [None, "abc"] and stub.finished == 2
-    assert stub.started[0]["config"] == CONFIG.as_dict() and stub.started[0]["name"] == tmp_path.name
-    monkeypatch.setattr(stub, "init", lambda **_: (_ for _ in ()).throw(RuntimeError("no login")))
-    with pytest.raises(ValueError, match="--wandb: wandb cannot start: no login"):
-        TrainingLog(tmp_path, trainer, ("wandb",)).__enter__()
