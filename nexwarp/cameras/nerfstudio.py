@@ -188,9 +188,9 @@ def _frames(path: Path, data: JsonObject, near: float) -> dict[str, Camera]:
         where = f"{path}: frames[{i}]"
         pose = matrix_of(where, frame, "transform_matrix")
         pose[:3, 3] /= scale
-        values = {**data, **frame}
+        values = merged(frame, data)
         width, height = (_size(where, values, key) for key in ("w", "h"))
-        intrinsics = intrinsics_of(where, values, width, height)
+        intrinsics = intrinsics_of(where, frame, data, width, height)
         name = one_line(frame.get("file_path", f"{i:04d}"))
         if name in cameras:
             raise ValueError(f"{where}.file_path: expected a name of its own, got {name!r} again")
@@ -207,24 +207,36 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
     return dict(zip(INTRINSICS, (camera.fx, camera.fy, camera.cx, camera.cy), strict=True))
 
 
-def intrinsics_of(where: str, values: Mapping[str, Json], width: int, height: int) -> tuple[float, ...]:
-    """Read fx, fy, cx and cy in pixels from the keys of a frame and its file; ValueError where one does not fit.
+def intrinsics_of(
+    where: str, frame: Mapping[str, Json], file: Mapping[str, Json], width: int, height: int
+) -> tuple[float, ...]:
+    """Read fx, fy, cx and cy in pixels; ValueError where one does not fit.
 
-    An axis without a focal length or field of view has the other's focal length; the principal point is the image's
-    centre by default.
+    A focal length or field of view of the frame goes before those of the file, `fl_x` before `camera_angle_x`; an axis
+    without one has the other's focal length. The principal point is the frame's, the file's or the image's centre.
     """
-    focal = []
-    for axis, side in (("x", width), ("y", height)):
-        if f"fl_{axis}" in values:
-            focal.append(number_of(where, values, f"fl_{axis}"))
-        elif f"camera_angle_{axis}" in values:
-            angle = number_of(where, values, f"camera_angle_{axis}", above=0.0, below=math.pi)
-            focal.append(0.5 * side / math.tan(0.5 * angle))
+    focal: list[float] = []
+    for values in (frame, file):
+        for axis, side in (("x", width), ("y", height)) if not focal else ():
+            if values.get(f"fl_{axis}") is not None:
+                focal.append(number_of(where, values, f"fl_{axis}"))
+            elif values.get(f"camera_angle_{axis}") is not None:
+                angle = number_of(where, values, f"camera_angle_{axis}", above=0.0, below=math.pi)
+                focal.append(0.5 * side / math.tan(0.5 * angle))
     if not focal:
         raise ValueError(f"{where}: expected a focal length (fl_x or camera_angle_x), found none")
-    cx = number_of(where, values, "cx") if "cx" in values else width / 2
-    cy = number_of(where, values, "cy") if "cy" in values else height / 2
-    return focal[0], focal[-1], cx, cy
+    values = merged(frame, file)
+    centre = []
+    for key, side_key, side in (("cx", "w", width), ("cy", "h", height)):
+        if key in values and frame.get(key) is None and file.get(side_key, side) not in (None, side):
+            raise ValueError(f"{where}: {key}: expected one of the frame's own, as its {side_key} is not the file's")
+        centre.append(number_of(where, values, key) if key in values else side / 2)
+    return focal[0], focal[-1], *centre
+
+
+def merged(frame: Mapping[str, Json], file: Mapping[str, Json]) -> JsonObject:
+    """The values of a frame, and those of its file that it does not have; null counts as none."""
+    return {key: value for values in (file, frame) for key, value in values.items() if value is not None}
 
 
 def _camera(

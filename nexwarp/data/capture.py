@@ -166,22 +166,22 @@ def report_missing(source: Path, names: Sequence[str], count: int, skip: bool) -
 
 
 def report_unused(source: Path, folder: Path, photos: Iterable[Photo]) -> None:
-    """Warn of pictures below the folder of the photos that are none of them."""
-    used = {_folded(photo.file) for photo in photos}
+    """Warn of pictures below the folder of the photos that are none of them, unless no photo lies there."""
+    used = {plain_name(str(photo.file)).casefold() for photo in photos}
     files = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
     pictures = [file for file in files if file.suffix.lower() in PICTURES and not file.name.startswith(".")]
-    unused = sorted(str(file.relative_to(folder)) for file in pictures if _folded(file) not in used)
-    if unused:
+    unused = sorted(str(file.relative_to(folder)) for file in pictures if plain_name(str(file)).casefold() not in used)
+    if unused and len(pictures) - len(unused) > 1:  # fewer photos are an error
         warnings.warn(
-            f"{folder}: {len(unused)} of {len(pictures)} photos are not in {source}, so they are not used: "
+            f"{folder}: {len(unused)} of {len(pictures)} photos are not used, as {source} does not list them: "
             f"{one_line(_listed(unused, 8), 400)}",
             stacklevel=2,
         )
 
 
-def _folded(file: Path) -> str:
-    """A path as file systems that tell neither case nor Unicode forms apart see it."""
-    return unicodedata.normalize("NFC", str(file)).casefold()
+def plain_name(name: str) -> str:
+    """A name in one Unicode form, for comparisons."""
+    return unicodedata.normalize("NFC", name)
 
 
 def _listed(names: Sequence[str], most: int) -> str:

@@ -5,30 +5,41 @@ from pathlib import Path
 
 import numpy as np
 
-from nexwarp.cameras.nerfstudio import intrinsics_of, matrix_of, number_of
+from nexwarp.cameras.nerfstudio import intrinsics_of, matrix_of, merged, number_of
 from nexwarp.data.capture import short
 from nexwarp.data.images import image_size
-from nexwarp.data.lens import PANORAMA, Lens
+from nexwarp.data.lens import BROWN, PANORAMA, Lens
 from nexwarp.io.json_files import JsonObject
 
 ROTATION_TOLERANCE = 1e-3  # that of Camera
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of COLMAP's FULL_OPENCV
 FISHEYE = ("k1", "k2", "k3", "k4")
+DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")  # in the order of nerfstudio's list
+# Keys of lenses and shutters; what is not read of them would change the picture.
+OPTICAL = re.compile(
+    r"[kpsb]\d*|tau_?[xy\d]*|xi|skew|(radial|tangential|principal|focal|transform_matrix_)\w*"
+    r"|\w*(distort|shutter|fisheye|ftheta|latlong|equirect|intrinsic|fov|lens_)\w*|lens_?(mode|model|type|params?)",
+    re.IGNORECASE,
+)
+LENS_KEYS = {*RADIAL_TANGENTIAL, "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"}
+LENS_KEYS |= {"camera_model", "is_fisheye", "is_equirectangular", "equirectangular", "distortion_params"}
 
 
-def frame_lens(where: str, keys: JsonObject, file: Path) -> Lens:
+def frame_lens(where: str, frame: JsonObject, shared: JsonObject, file: Path) -> Lens:
     """Read the lens of a frame.
 
     Args:
         where: place of the frame, for messages.
-        keys: the file's keys, overridden by those of the frame.
+        frame: the frame's keys, which go before `shared`, those of the file.
+        shared: the keys of the JSON file.
         file: the image file, whose size is used if `w` or `h` is missing.
 
     Raises:
-        ValueError: a size, camera model, coefficient or focal length is missing or invalid.
+        ValueError: a size, camera model, coefficient or focal length is missing or invalid, or a key of a lens or
+            shutter is not known.
     """
-    keys = {key: value for key, value in keys.items() if value is not None}
+    keys = merged(frame, shared)
     columns: float
     rows: float
     if "w" in keys and "h" in keys:
@@ -38,46 +49,67 @@ def frame_lens(where: str, keys: JsonObject, file: Path) -> Lens:
     if any(side != int(side) or side < 1 for side in (columns, rows)):
         raise ValueError(f"{where}: w, h: expected whole numbers of pixels, got {columns:g}x{rows:g}")
     width, height = int(columns), int(rows)
-    model, known, coefficients = _distortion(where, keys)
-    unknown = [key for key in keys if re.fullmatch(r"[kps]\d", key) and key not in known and keys[key]]
-    if unknown:
-        raise ValueError(f"{where}: lens coefficient {unknown[0]} is no part of camera model {model}")
+    model, coefficients = _distortion(where, _with_list(where, frame, shared))
     try:
         if model == PANORAMA:
             return Lens(model, (float(width), float(height)), width, height)
-        return Lens(model, (*intrinsics_of(where, keys, width, height), *coefficients), width, height)
+        return Lens(model, (*intrinsics_of(where, frame, shared, width, height), *coefficients), width, height)
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(where) else f"{where}: {text}") from None
 
 
-def _distortion(where: str, keys: JsonObject) -> tuple[str, tuple[str, ...], list[float]]:
-    """COLMAP's camera model of a frame, the keys of its coefficients, and their values in COLMAP's order.
+def _with_list(where: str, frame: JsonObject, shared: JsonObject) -> JsonObject:
+    """The keys of a frame and its file, with nerfstudio's list of coefficients under their names."""
+    levels = []
+    for keys in (frame, shared):
+        coefficients = keys.get("distortion_params")
+        if coefficients is None:
+            levels.append(keys)
+            continue
+        if not isinstance(coefficients, list) or len(coefficients) > len(DISTORTION_PARAMS):
+            expected = f"a list of {', '.join(DISTORTION_PARAMS)}"
+            raise ValueError(f"{where}: distortion_params: expected {expected}, got {short(coefficients)}")
+        if any(keys.get(key) for key in RADIAL_TANGENTIAL):
+            raise ValueError(f"{where}: distortion_params: expected them or k1, k2 and so on, got both")
+        levels.append({**keys, **dict(zip(DISTORTION_PARAMS, coefficients, strict=False))})
+    return merged(*levels)
 
-    The model is the simplest one with the coefficients that are not 0.
+
+def _distortion(where: str, keys: JsonObject) -> tuple[str, list[float]]:
+    """The camera model of a frame, and its coefficients in the order of `Lens`.
+
+    The model is the simplest one with the coefficients that are not 0. `k4` is the factor of r^8, as nerfstudio has it
+    from Metashape and RealityCapture; beside k5 and k6, or in a FULL_OPENCV camera, it is OpenCV's, of a denominator.
     """
-    model = keys.get("camera_model")
-    if model is None:
-        model = "OPENCV_FISHEYE" if keys.get("is_fisheye") else PANORAMA if keys.get("is_equirectangular") else "OPENCV"
-    if model == PANORAMA:
-        return PANORAMA, (), []
-    if model == "OPENCV_FISHEYE":
-        return "OPENCV_FISHEYE", FISHEYE, _coefficients(where, keys, FISHEYE)
-    if model not in PERSPECTIVE:
+    flags = {
+        "OPENCV_FISHEYE": bool(keys.get("is_fisheye")),
+        PANORAMA: bool(keys.get("is_equirectangular") or keys.get("equirectangular")),
+    }
+    model = keys.get("camera_model", next((name for name, flag in flags.items() if flag), "OPENCV"))
+    if model not in (*PERSPECTIVE, *flags):
         raise ValueError(
             f"{where}: camera_model: expected one of {', '.join(PERSPECTIVE)}, OPENCV_FISHEYE, EQUIRECTANGULAR, "
             f"got {short(model)}"
         )
-    coefficients = _coefficients(where, keys, RADIAL_TANGENTIAL)
-    if not any(coefficients):
-        return "PINHOLE", RADIAL_TANGENTIAL, []
-    if not any(coefficients[4:]):
-        return "OPENCV", RADIAL_TANGENTIAL, coefficients[:4]
-    return "FULL_OPENCV", RADIAL_TANGENTIAL, coefficients
-
-
-def _coefficients(where: str, keys: JsonObject, names: tuple[str, ...]) -> list[float]:
-    return [number_of(where, keys, name) if name in keys else 0.0 for name in names]
+    contrary = [name for name, flag in flags.items() if flag and name != model]
+    if contrary:
+        raise ValueError(f"{where}: camera_model, is_fisheye: expected one lens, got {model} and {contrary[0]}")
+    known = {PANORAMA: (), "OPENCV_FISHEYE": FISHEYE}.get(model, RADIAL_TANGENTIAL)
+    for key, value in keys.items():
+        if key not in known and (key in RADIAL_TANGENTIAL or (key not in LENS_KEYS and OPTICAL.fullmatch(key))):
+            if any(value) if isinstance(value, list) else value:
+                raise ValueError(f"{where}: {key}: expected no such key of a {model} camera, got {short(value)}")
+    coefficients = [number_of(where, keys, name) if name in keys else 0.0 for name in known]
+    if known != RADIAL_TANGENTIAL:
+        return model, coefficients
+    if model == "FULL_OPENCV" or "k5" in keys or "k6" in keys:
+        return ("FULL_OPENCV", coefficients) if any(coefficients) else ("PINHOLE", [])
+    if coefficients[5]:
+        return BROWN, coefficients[:6]
+    if coefficients[4]:
+        return "FULL_OPENCV", coefficients
+    return ("OPENCV", coefficients[:4]) if any(coefficients) else ("PINHOLE", [])
 
 
 def _check_rotation(where: str, key: str, rotation: np.ndarray, what: str) -> None:

@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 PANORAMA = "EQUIRECTANGULAR"
+BROWN = "BROWN"  # OPENCV with a polynomial up to r^8, of Metashape and RealityCapture, which COLMAP does not have
+BROWN_PARAMS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4")
+WIDE = ("FISHEYE", "FOV", "EUCM", "DIVISION")  # ends of the names of models that can see more than 180 degrees
+LEAST_SCALE, MOST_SCALE = 0.2, 2.0  # of the sides of an undistorted image, in those of the photo
+NEWTON_STEPS, NEWTON_DELTA = 50, 1e-7
 MAX_SIDE = 2**16  # pixels, of an undistorted image
 MIN_FOCAL, MAX_PARAMETER = 1e-3, 1e9  # pixels; rays and pixels stay finite in single precision
 ROWS = 128  # rows of a map that are computed at a time, as their rays are float64
@@ -87,11 +92,11 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class Lens:
-    """The camera of a photo before undistortion: one of COLMAP's camera models.
+    """The camera of a photo before undistortion: one of COLMAP's camera models, or BROWN.
 
     Attributes:
-        model: COLMAP's name, such as OPENCV.
-        params: parameters in COLMAP's order, in pixels of a width x height image.
+        model: COLMAP's name, such as OPENCV; or BROWN.
+        params: parameters in COLMAP's order, in pixels of a width x height image; of BROWN those of `BROWN_PARAMS`.
         width: width of the photo in pixels.
         height: height of the photo in pixels.
 
@@ -108,14 +113,19 @@ class Lens:
     def __post_init__(self) -> None:
         if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
             raise ValueError(f"expected an image size of 1 to {MAX_SIDE} pixels, got {self.width}x{self.height}")
-        if self.model == "INVALID" or self.model not in pycolmap_module().CameraModelId.__members__:
+        if self.model == BROWN:
+            fitting, expected, focal_places = len(self.params) == len(BROWN_PARAMS), ", ".join(BROWN_PARAMS), [0, 1]
+        elif self.model == "INVALID" or self.model not in pycolmap_module().CameraModelId.__members__:
             raise ValueError(f"camera model {self.model} is unknown to COLMAP")
-        camera = self._camera()
-        if not camera.verify_params():
-            raise ValueError(f"camera model {self.model}: expected {camera.params_info}, got {len(self.params)} values")
+        else:
+            camera = self._camera()
+            fitting, expected = camera.verify_params(), camera.params_info
+            focal_places = camera.focal_length_idxs() if fitting else []
+        if not fitting:
+            raise ValueError(f"camera model {self.model}: expected {expected}, got {len(self.params)} values")
         if not all(map(math.isfinite, self.params)):
             raise ValueError(f"camera model {self.model}: expected finite parameters, got {self.params}")
-        focal = [self.params[index] for index in camera.focal_length_idxs()]
+        focal = [self.params[index] for index in focal_places]
         if min(focal, default=1.0) <= 0:
             raise ValueError(f"K: expected focal lengths > 0, got {', '.join(f'{f:g}' for f in focal)}")
         if min(focal, default=1.0) < MIN_FOCAL or max(map(abs, self.params), default=1.0) > MAX_PARAMETER:
@@ -134,31 +144,83 @@ class Lens:
 
         The undistorted image shows the largest part of the photo without empty corners. It has the photo's focal length
         and is at most twice as wide and high. The faces of a panorama have the resolution of its equator.
-
-        Raises:
-            ValueError: the parameters allow no undistortion.
         """
-        if not self.distorted:
-            return Intrinsics(np.array(self._camera().calibration_matrix()), self.width, self.height)
         if self.model == PANORAMA:
             side = max(round(self.width / math.pi), 1)
             K = np.array([[side / 2, 0.0, side / 2], [0.0, side / 2, side / 2], [0.0, 0.0, 1.0]])
             return Intrinsics(K, side, side)
-        pycolmap = pycolmap_module()
-        options = pycolmap.UndistortCameraOptions()
-        camera = pycolmap.undistort_camera(options, self._camera())
-        K = np.array(camera.calibration_matrix())
-        if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE and np.isfinite(K).all()):
+        K = self._matrix()
+        if not self.distorted:
+            return Intrinsics(K, self.width, self.height)
+        photo, sides = (self.width, self.height), [1, 1]
+        for axis in (0, 1):
+            side, focal, centre = photo[axis], K[axis, axis], K[axis, 2]
+            border = np.empty((photo[1 - axis], 2))
+            border[:, 1 - axis] = np.arange(photo[1 - axis]) + 0.5
+            border[:, axis] = 0.5
+            first = centre + focal * self._tangents(border, axis, -math.inf).max()
+            border[:, axis] = side - 0.5
+            last = centre + focal * self._tangents(border, axis, math.inf).min()
+            with np.errstate(divide="ignore"):
+                scale = 1 / np.maximum(centre / (centre - first), (side - 0.5 - centre) / (last - centre))
+            sides[axis] = max(int(side * np.clip(np.nan_to_num(scale, nan=1.0), LEAST_SCALE, MOST_SCALE)), 1)
+            K[axis, 2] *= sides[axis] / side
+        if max(sides) > MAX_SIDE:
             raise ValueError(f"camera model {self.model}: cannot undistort with the parameters {self.params}")
-        return Intrinsics(K, int(camera.width), int(camera.height))
+        return Intrinsics(K, *sides)
+
+    def _tangents(self, pixels: np.ndarray, axis: int, beyond: float) -> np.ndarray:
+        """Positions (N,) along an axis at depth 1 of pixels (N, 2); `beyond` where the lens sees more than 180 degrees.
+
+        COLMAP gives pixels beyond 180 degrees a direction in front of the camera, which is that of another pixel.
+        """
+        rays = self.unproject(pixels)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            tangents = rays[:, axis] / rays[:, 2]
+            if self.model.endswith(WIDE):
+                seen = (rays[:, 2] > 0) & (np.abs(self.project(rays) - pixels).max(axis=1) <= BORDER)
+                return np.where(seen, tangents, beyond)
+        return np.where(np.isnan(tangents), beyond, tangents)
 
     def project(self, rays: np.ndarray) -> np.ndarray:
         """Pixel coordinates (N, 2) float64 of camera-frame directions (N, 3); NaN outside the lens's field of view."""
+        if self.model == BROWN:
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                flat = np.where(rays[:, 2:] > 0, rays[:, :2] / rays[:, 2:], np.nan)
+                return self._bent(flat) * self.params[:2] + self.params[2:4]
         return np.asarray(self._camera().img_from_cam(np.ascontiguousarray(rays, dtype=np.float64)))
 
     def unproject(self, pixels: np.ndarray) -> np.ndarray:
         """Camera-frame directions (N, 3) float64 of pixel coordinates (N, 2); NaN if a pixel has none."""
-        return np.asarray(self._camera().cam_ray_from_img(np.ascontiguousarray(pixels, dtype=np.float64)))
+        if self.model != BROWN:
+            return np.asarray(self._camera().cam_ray_from_img(np.ascontiguousarray(pixels, dtype=np.float64)))
+        bent = (pixels - self.params[2:4]) / self.params[:2]
+        flat = bent.copy()
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            for _ in range(NEWTON_STEPS):
+                error = self._bent(flat) - bent
+                a, c = ((self._bent(flat + step) - bent - error) / NEWTON_DELTA for step in np.eye(2) * NEWTON_DELTA)
+                determinant = a[:, 0] * c[:, 1] - a[:, 1] * c[:, 0]
+                flat[:, 0] -= (c[:, 1] * error[:, 0] - c[:, 0] * error[:, 1]) / determinant
+                flat[:, 1] -= (a[:, 0] * error[:, 1] - a[:, 1] * error[:, 0]) / determinant
+        return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+
+    def _bent(self, flat: np.ndarray) -> np.ndarray:
+        """Distorted positions (N, 2) of positions at depth 1, by Brown's polynomial."""
+        k1, k2, p1, p2, k3, k4 = self.params[4:]
+        x, y = flat[:, 0], flat[:, 1]
+        r = x * x + y * y
+        radial = 1 + r * (k1 + r * (k2 + r * (k3 + r * k4)))
+        bent_x = x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x)
+        bent_y = y * radial + 2 * p2 * x * y + p1 * (r + 2 * y * y)
+        return np.stack([bent_x, bent_y], axis=1)
+
+    def _matrix(self) -> np.ndarray:
+        """(3, 3) float64 intrinsics without the distortion."""
+        if self.model != BROWN:
+            return np.array(self._camera().calibration_matrix())
+        fx, fy, cx, cy = self.params[:4]
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def _camera(self) -> "pycolmap.Camera":
         camera: pycolmap.Camera = pycolmap_module().Camera(
@@ -220,6 +282,19 @@ class Maps:
             return self._maps[key]
 
 
+@lru_cache(maxsize=256)
+def _reach(lens: Lens) -> float:
+    """Tangent of the angle from the axis up to which a lens is one to one; polynomials turn back beyond."""
+    tangents = np.tan(np.radians(np.linspace(0.0, 89.5, 359)))
+    turns = np.arange(8) * math.pi / 4
+    flat = tangents[:, None, None] * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    rays = np.concatenate([flat, np.ones((*flat.shape[:2], 1))], axis=-1)
+    pixels = lens.project(rays.reshape(-1, 3)).reshape(flat.shape)
+    with np.errstate(invalid="ignore", over="ignore"):
+        farther = (np.diff(np.linalg.norm(pixels - pixels[:1], axis=-1), axis=0) > 0).all(axis=1)
+    return math.inf if farther.all() else float(tangents[max(int(np.argmin(farther)) - 1, 0)])
+
+
 def _map(lens: Lens, target: Intrinsics, face: str | None) -> Map:
     grid = np.empty((target.height, target.width, 2), np.float32)
     valid = np.empty((target.height, target.width), bool)
@@ -235,5 +310,7 @@ def _map(lens: Lens, target: Intrinsics, face: str | None) -> Map:
         size = np.array([lens.width, lens.height], np.float64)
         with np.errstate(invalid="ignore", over="ignore"):
             valid[rows] = ((pixels >= -BORDER) & (pixels <= size + BORDER)).all(axis=-1)
+            if face is None:
+                valid[rows] &= np.hypot(x, y[:, None]) <= _reach(lens)
             grid[rows] = np.nan_to_num(2.0 * pixels / size - 1.0, nan=0.0, posinf=2.0, neginf=-2.0).clip(-2.0, 2.0)
     return Map(torch.from_numpy(grid)[None], None if valid.all() else torch.from_numpy(valid))

@@ -8,14 +8,28 @@ import dataclasses
 import warnings
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import cast
 
 import numpy as np
 
 from nexwarp.cameras.camera import MAX_CAMERAS
-from nexwarp.data.capture import Capture, Cloud, Photo, check_points, inside_folder, report_missing, safe_name, short
-from nexwarp.data.frame_camera import frame_lens, frame_viewmat, inverse_applied
+from nexwarp.data.capture import (
+    Capture,
+    Cloud,
+    Photo,
+    check_points,
+    find_file,
+    inside_folder,
+    plain_name,
+    report_missing,
+    report_unused,
+    safe_name,
+    short,
+)
+from nexwarp.data.frame_camera import LENS_KEYS, OPTICAL, frame_lens, frame_viewmat, inverse_applied
 from nexwarp.data.images import read_image
 from nexwarp.data.ply import read_ply
+from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json, JsonObject, read_object
 
 NERFSTUDIO_FILE = "transforms.json"
@@ -23,6 +37,11 @@ BLENDER_FILES = {split: f"transforms_{split}.json" for split in ("train", "test"
 BLENDER_POINTS = "points3d.ply"
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 WHITE = (1.0, 1.0, 1.0)
+FILE_KEYS = {"frames", "test_frames", "applied_transform", "applied_scale", "ply_file_path"}
+FILE_KEYS |= {"train_filenames", "val_filenames", "test_filenames"}
+FRAME_KEYS = {"file_path", "transform_matrix", "mask_path"}
+# Of other programs' own scaling and bookkeeping: without them the scene is the same.
+HARMLESS = {"aabb", "aabb_scale", "scale", "offset", "up", "sharpness", "rotation", "colmap_im_id"}
 AGREEMENT = 2.0  # ratio of colour errors from which points count as being in the original world
 JUDGED_PHOTOS, JUDGED_POINTS = 5, 5000
 
@@ -35,6 +54,7 @@ class _Frames:
         file: the file.
         data: its keys.
         photos: its photos that exist, sorted by name.
+        held_out: names of the photos of ScanNet++'s `test_frames`.
         missing: names of the photos that do not exist.
         to_original: (4, 4) float64 similarity from the file's world frame to the original one.
         follow_links: whether files may lie behind links that leave the scene's folder.
@@ -43,6 +63,7 @@ class _Frames:
     file: Path
     data: JsonObject
     photos: list[Photo]
+    held_out: set[str]
     missing: list[str]
     to_original: np.ndarray
     follow_links: bool
@@ -62,6 +83,7 @@ def read_nerfstudio(path: Path, images: str, follow_links: bool = False, skip_mi
         ValueError: the file has invalid content; the message names the place.
     """
     frames = _read_frames(path / NERFSTUDIO_FILE, images, follow_links, skip_missing)
+    report_unused(frames.file, path / images, frames.photos)
     photos, test = _split(frames)
     return Capture(frames.file, photos, _points(frames), test)
 
@@ -81,10 +103,10 @@ def read_blender(path: Path, images: str, follow_links: bool = False, skip_missi
         (path / BLENDER_FILES[part] for part in ("test", "val") if (path / BLENDER_FILES[part]).is_file()), None
     )
     if file is None:
-        return Capture(train_file, train.photos, cloud, None, WHITE)
+        return Capture(train_file, train.photos, cloud, frozenset(train.held_out) or None, WHITE)
     held_out = _read_frames(file, images, follow_links, skip_missing).photos
-    test = frozenset(photo.name for photo in held_out)
-    again = [photo.name for photo in train.photos if photo.name in test]
+    test = frozenset(photo.name for photo in held_out) | train.held_out
+    again = [photo.name for photo in train.photos if photo.name in test - train.held_out]
     if again:
         raise ValueError(f"{file}: {again[0]} is in {train_file.name} too, expected other photos to judge by")
     return Capture(train_file, sorted(train.photos + held_out, key=lambda photo: photo.name), cloud, test, WHITE)
@@ -92,51 +114,76 @@ def read_blender(path: Path, images: str, follow_links: bool = False, skip_missi
 
 def _read_frames(file: Path, images: str, follow_links: bool, skip_missing: bool) -> _Frames:
     data = read_object(file, finite=True)
-    entries = data.get("frames")
-    if not isinstance(entries, list) or not entries:
-        raise ValueError(f"{file}: frames: expected a list of at least one frame, got {short(entries)}")
-    if len(entries) > MAX_CAMERAS:
-        raise ValueError(f"{file}: frames: expected at most {MAX_CAMERAS:,} frames, got {len(entries):,}")
-    frames = _Frames(file, data, [], [], inverse_applied(file, data), follow_links)
-    names: set[str] = set()
-    for index, entry in enumerate(entries):
+    entries = _entries(file, data, "frames")
+    tests = [] if data.get("test_frames") is None else _entries(file, data, "test_frames")
+    _name_unread(file, data, entries + tests)
+    frames = _Frames(file, data, [], set(), [], inverse_applied(file, data), follow_links)
+    seen: dict[Path, str] = {}
+    for index, entry in enumerate(entries + tests):
         where = f"{file}: frame {index}"
-        if not isinstance(entry, dict):
-            raise ValueError(f"{where}: expected a JSON object, got {short(entry)}")
-        named = _file_name(where, "file_path", entry.get("file_path"))
+        if index >= len(entries):
+            where = f"{file}: test frame {index - len(entries)}"
+        named = _file_name(where, "file_path", entry.get("file_path"), file.parent)
         where = f"{where} ({named})"
         photo_file = _find(where, file.parent, named, images)
         if photo_file is None:
             frames.missing.append(named)
             continue
         name = _view_name(str(PurePosixPath(named).with_name(photo_file.name)))
-        if name in names:
+        if photo_file in seen:
             raise ValueError(f"{file}: expected each photo once, got {name} twice")
-        names.add(name)
+        seen[photo_file] = name
         folder = file.parent / images if PurePosixPath(named).is_relative_to("images") else file.parent
         inside_folder(f"{where}: file_path", photo_file, folder, follow_links)
         frames.photos.append(_photo(where, frames, entry, name, photo_file))
-    report_missing(file, frames.missing, len(entries), skip_missing)
+        if index >= len(entries):
+            frames.held_out.add(name)
+    report_missing(file, frames.missing, len(entries + tests), skip_missing)
     frames.photos.sort(key=lambda photo: photo.name)
     return frames
+
+
+def _entries(file: Path, data: JsonObject, key: str) -> list[JsonObject]:
+    """Check a list of frames."""
+    entries = data.get(key)
+    if not isinstance(entries, list) or not entries:
+        raise ValueError(f"{file}: {key}: expected a list of at least one frame, got {short(entries)}")
+    if len(entries) > MAX_CAMERAS:
+        raise ValueError(f"{file}: {key}: expected at most {MAX_CAMERAS:,} frames, got {len(entries):,}")
+    for index, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise ValueError(f"{file}: {key.removesuffix('s')} {index}: expected a JSON object, got {short(entry)}")
+    return cast(list[JsonObject], entries)
+
+
+def _name_unread(file: Path, data: JsonObject, entries: list[JsonObject]) -> None:
+    """Warn of keys that have no meaning here."""
+    unread = {key for key, value in data.items() if value is not None} - FILE_KEYS
+    unread |= {key for entry in entries for key, value in entry.items() if value is not None} - FRAME_KEYS
+    unread -= LENS_KEYS | HARMLESS
+    unread = {key for key in unread if not OPTICAL.fullmatch(key)}  # refused where they say anything
+    if unread:
+        names = one_line(", ".join(sorted(unread)), 400)
+        warnings.warn(f"{file}: keys that are not read: {names}", stacklevel=2)
 
 
 def _photo(where: str, frames: _Frames, entry: JsonObject, name: str, file: Path) -> Photo:
     mask = None
     if entry.get("mask_path") is not None:
-        mask = frames.file.parent / _file_name(where, "mask_path", entry["mask_path"])
+        folder = frames.file.parent
+        mask = find_file(folder, _file_name(where, "mask_path", entry["mask_path"], folder))
         if not mask.is_file():
             raise FileNotFoundError(f"{where}: mask not found: {mask}")
-        inside_folder(f"{where}: mask_path", mask, frames.file.parent, frames.follow_links)
-    lens = frame_lens(where, {**frames.data, **entry}, file)
+        inside_folder(f"{where}: mask_path", mask, folder, frames.follow_links)
+    lens = frame_lens(where, entry, frames.data, file)
     return Photo(name, file, frame_viewmat(where, entry, frames.to_original), lens, mask)
 
 
-def _file_name(where: str, key: str, value: Json) -> str:
-    """Check a path relative to the scene's folder and return it with "/" as separator."""
+def _file_name(where: str, key: str, value: Json, folder: Path) -> str:
+    """Check a path in the scene's folder and return it relative to that, with "/" as separator."""
     if not isinstance(value, str) or not value:
         raise ValueError(f"{where}: {key}: expected the name of a file, got {short(value)}")
-    return safe_name(f"{where}: {key}:", value.replace("\\", "/"), "scene's folder")
+    return safe_name(f"{where}: {key}:", value, "scene's folder", folder)
 
 
 def _view_name(named: str) -> str:
@@ -146,19 +193,20 @@ def _view_name(named: str) -> str:
 def _find(where: str, folder: Path, named: str, images: str) -> Path | None:
     """Find an image file, in the folder `images` and with an extension if the name has none; None if there is none."""
     if images != "images":
-        if not named.startswith("images/"):
+        if "/" in named and not named.startswith("images/"):
             raise ValueError(f"images: {where} is in no folder images, so {images!r} cannot stand in for it")
-        named = f"{images}/{named[7:]}"
-    path = folder / named
-    if path.is_file():
-        return path
-    candidates = (path.with_name(path.name + extension) for extension in EXTENSIONS)
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+        named = f"{images}/{_view_name(named)}"
+    # ScanNet++ names photos without their folder.
+    names = [base + extension for base in (named, f"{images}/{named}") for extension in ("", *EXTENSIONS)]
+    files = (find_file(folder, name) for name in names)
+    return next((file for file in files if file.is_file()), None)
 
 
 def _split(frames: _Frames) -> tuple[list[Photo], frozenset[str] | None]:
     """Return the photos in use and the names of the test photos; None if the file has no split."""
-    known = {photo.name for photo in frames.photos} | {_view_name(name) for name in frames.missing}
+    known = {plain_name(photo.name) for photo in frames.photos} | {
+        plain_name(_view_name(name)) for name in frames.missing
+    }
     known |= {str(PurePosixPath(name).with_suffix("")) for name in known}
     lists: dict[str, set[str]] = {}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
@@ -167,18 +215,21 @@ def _split(frames: _Frames) -> tuple[list[Photo], frozenset[str] | None]:
             continue
         if not isinstance(names, list):
             raise ValueError(f"{frames.file}: {key}: expected a list of file names, got {short(names)}")
-        lists[key] = {_view_name(_file_name(str(frames.file), key, name)) for name in names}
+        folder = frames.file.parent
+        lists[key] = {plain_name(_view_name(_file_name(str(frames.file), key, name, folder))) for name in names}
         unknown = sorted(lists[key] - known)
         if unknown:
             raise ValueError(f"{frames.file}: {key}: expected photos of the frames, got {unknown[0]}")
     if not lists:
-        return frames.photos, None
+        return frames.photos, frozenset(frames.held_out) or None
 
     def listed(names: set[str]) -> list[Photo]:
-        return [p for p in frames.photos if p.name in names or str(PurePosixPath(p.name).with_suffix("")) in names]
+        plain = [(photo, plain_name(photo.name)) for photo in frames.photos]
+        return [photo for photo, name in plain if name in names or str(PurePosixPath(name).with_suffix("")) in names]
 
     test = listed(lists.get("test_filenames") or lists.get("val_filenames") or set())
-    tests = frozenset(photo.name for photo in test)
+    tests = frozenset(photo.name for photo in test) | frames.held_out
+    test = [photo for photo in frames.photos if photo.name in tests]
     candidates = listed(lists["train_filenames"]) if "train_filenames" in lists else frames.photos
     train = [photo for photo in candidates if photo.name not in tests]
     both = len(candidates) - len(train)
@@ -199,7 +250,8 @@ def _points(frames: _Frames, beside: str | None = None) -> Cloud | None:
     folder = frames.file.parent
     named = frames.data.get("ply_file_path")
     if named is not None:
-        key, path = "ply_file_path", folder / _file_name(str(frames.file), "ply_file_path", named)
+        key = "ply_file_path"
+        path = find_file(folder, _file_name(str(frames.file), key, named, folder))
         if not path.is_file():
             raise FileNotFoundError(f"{frames.file}: {key}: points not found: {path}")
     elif beside is not None and (folder / beside).is_file():

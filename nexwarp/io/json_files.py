@@ -1,5 +1,6 @@
 """JSON files: written atomically; read with bounds on size and depth, and with errors of one line."""
 
+import codecs
 import json
 import re
 from pathlib import Path
@@ -52,6 +53,7 @@ def parse_json(where: str, content: bytes, *, max_bytes: int = MAX_BYTES, finite
     """
     if len(content) > max_bytes:
         raise ValueError(f"{where}: expected at most {max_bytes:,} bytes of JSON, got {len(content):,}")
+    content = content.removeprefix(codecs.BOM_UTF8)
     steps = np.frombuffer(STRINGS.sub(b"", content).translate(STEPS, OTHERS), np.int8)
     # Each list or object takes about a microsecond and several hundred bytes, whatever it is used for.
     if len(steps) > 2 * MAX_CONTAINERS:

@@ -24,6 +24,7 @@ LENSES = {
     "SIMPLE_DIVISION": (80.0, 61.5, 43.0, -0.1),
     "DIVISION": (*F, -0.1),
     "EUCM": (*F, 0.5, 1.1),
+    "BROWN": (*F, -0.15, 0.03, 0.002, -0.001, 0.01, 0.02),
 }
 
 
@@ -39,7 +40,7 @@ def rays_of(target) -> np.ndarray:
 
 def test_every_model_that_colmap_has_is_here():
     known = set(pycolmap_module().CameraModelId.__members__) - {"INVALID", "PINHOLE", "SIMPLE_PINHOLE"}
-    assert known == set(LENSES) | {"EQUIRECTANGULAR"}
+    assert known | {"BROWN"} == set(LENSES) | {"EQUIRECTANGULAR"}
 
 
 def opencv(x, y, k1, k2, p1, p2):

@@ -107,7 +107,7 @@ BAD = {
         "camera_model: .* got 'FISHEYE624'",
     ),
     "model of a list": (spoilt(lambda data: data.update(camera_model=[1])), r"camera_model: .* got \[1\]"),
-    "unknown coefficient": (spoilt(lambda data: data.update(p3=0.1)), "lens coefficient p3 is no part of camera model"),
+    "unknown coefficient": (spoilt(lambda data: data.update(p3=0.1)), "p3: expected no such key of a OPENCV camera"),
     "photos of another shape": (spoilt(lambda data: data.update(w=50, h=72)), "expected an image of 50x72 pixels"),
     "unknown test photo": (spoilt(lambda d: d.update(test_filenames=["images/q.png"])), "test_filenames: .* got q.png"),
     "split that is no list": (spoilt(lambda d: d.update(train_filenames=3)), "train_filenames: expected a list"),
@@ -148,12 +148,16 @@ def test_a_json_file_of_any_size_is_not_read(demo, tmp_path):
         load_scene(path)
 
 
-def test_unknown_keys_are_ignored(demo, tmp_path):
+def test_unknown_keys_are_named_once(demo, tmp_path):
     def change(data):
         data |= {"aabb_scale": 16, "orientation_override": "none", "offset": [1, 2]}
         data["frames"][0] |= {"sharpness": 12.5, "colmap_im_id": 3, "depth_file_path": "../nowhere"}
 
-    assert_same_cameras(load_scene(edit(write_nerfstudio(demo, tmp_path / "scene"), change)), load_scene(demo))
+    path = edit(write_nerfstudio(demo, tmp_path / "scene"), change)
+    with pytest.warns(UserWarning, match=r"keys that are not read: depth_file_path, orientation_override$") as caught:
+        scene = load_scene(path)
+    assert len(caught) == 1
+    assert_same_cameras(scene, load_scene(demo))
 
 
 def test_a_photo_may_not_be_in_both_of_blenders_files(demo, tmp_path):

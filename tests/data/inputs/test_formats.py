@@ -94,21 +94,6 @@ def test_points_that_were_left_in_the_original_world_are_noticed(demo, tmp_path)
     torch.testing.assert_close(scene.points, reference.points[seen])
 
 
-def test_a_frames_own_intrinsics_go_before_the_files(demo, tmp_path):
-    def change(data):
-        for index, frame in enumerate(data["frames"]):
-            frame |= {"fl_x": 100.0 + index, "cx": 40.0 + index}
-        for key in ("w", "h", "fl_y", "cy"):
-            del data[key]
-        data["camera_angle_y"] = 0.7
-
-    scene = load_scene(edit(write_nerfstudio(demo, tmp_path / "scene"), change))
-    for index, view in enumerate(views_of(scene)):
-        fy = 36.0 / np.tan(0.35)
-        expected = (100.0 + index, np.float32(fy), 40.0 + index, 36.0)
-        assert (view.camera.fx, view.camera.fy, view.camera.cx, view.camera.cy) == pytest.approx(expected)
-
-
 def test_lists_of_file_names_make_the_split(demo, tmp_path):
     def change(data):
         names = sorted(frame["file_path"] for frame in data["frames"])

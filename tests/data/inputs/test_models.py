@@ -121,7 +121,9 @@ def test_photos_that_the_model_lacks_are_named(tmp_path):
     path = make_scene(tmp_path)
     for name in ("x.JPG", "y.png"):
         shutil.copy(path / "images/00.png", path / "images" / name)
-    with pytest.warns(UserWarning, match=r"images: 2 of 12 photos are not in .*sparse/0, so .* not used: x.JPG, y.png"):
+    with pytest.warns(
+        UserWarning, match=r"images: 2 of 12 photos are not used, as .*sparse/0 does not .*: x.JPG, y.png"
+    ):
         load_scene(path)
 
 
