@@ -18,7 +18,7 @@ from nexwarp.cli import __version__, display
 from nexwarp.cli.commands import Export, Info, Render, Sfm, Warmup
 from nexwarp.cli.eval import Eval
 from nexwarp.cli.process import Process
-from nexwarp.cli.signals import stopped_by_signals
+from nexwarp.cli.signals import deferred_stop, stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.cli.view import ViewCommand
 from nexwarp.errors import NexwarpError, RankError
@@ -137,7 +137,8 @@ def _run(words: list[str]) -> int:
     console = OutputConsole()
     try:
         if isinstance(command, Train) and (count := command.starts()):
-            return launch(count, [*PROGRAM, *words])
+            with deferred_stop() as stop:
+                return launch(count, [*PROGRAM, *words], stop)
         with stopped_by_signals(), display.plain_warnings(console):
             command(console)
         sys.stdout.flush()

@@ -23,6 +23,7 @@ from nexwarp.io.files import one_line
 
 JOIN_SECONDS = 300.0
 WAIT_VARIABLE = "NEXWARP_JOIN_SECONDS"
+STORE = "NEXWARP_STORE"  # variable: the file through which the ranks of one machine find each other
 # A viewer may pause a training: it is the death of a rank that ends the others, not a long wait.
 FOREVER = timedelta(days=365)
 # What gloo and NCCL say when the process at the other end is gone.
@@ -58,18 +59,28 @@ class Ranks:
 
     @classmethod
     def join(cls, device: torch.device, *, backend: str | None = None) -> "Ranks":
-        """Join the other ranks that torchrun's environment variables tell of; RankError unless all come in time.
+        """Join the other ranks that the environment tells of; RankError unless all come in time.
 
-        `backend` is that of the gradients; None is NCCL for GPUs, else gloo.
+        `nexwarp train --gpus` names a file, and torchrun an address. `backend` is that of the gradients; None is NCCL
+        for GPUs, else gloo.
         """
         backend = backend or ("nccl" if device.type == "cuda" else "gloo")
         seconds = float(os.environ.get(WAIT_VARIABLE, JOIN_SECONDS))
+        wait = timedelta(seconds=seconds)
+        file = os.environ.get(STORE)
+        store: dist.Store
         try:
-            store, rank, size = next(rendezvous("env://", timeout=timedelta(seconds=seconds)))
+            if file is None:
+                store, rank, size = next(rendezvous("env://", timeout=wait))
+            else:
+                rank, size = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+                store = dist.FileStore(file, size)
+                store.set(f"rank {rank}", "is here")
+                store.wait([f"rank {other}" for other in range(size)], wait)
             store = PrefixStore("nexwarp", store)
             dist.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=FOREVER)
         except (RuntimeError, ValueError, OSError) as error:
-            place = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
+            place = file or f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
             expected = f"expected {os.environ['WORLD_SIZE']} ranks to join at {place} within {seconds:.0f} s"
             raise RankError(f"{expected} ({one_line(error)})") from None
         ranks = cls(rank, size, device, backend)
