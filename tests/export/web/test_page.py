@@ -208,6 +208,27 @@ def test_controls_modes_links_and_sizes(tab, site):
     assert not own, "no request leaves the page's own origin"
 
 
+@pytest.mark.parametrize("renderer", ["baked", "webgpu"])
+def test_a_double_click_turns_to_the_surfel_there(browser, site, renderer):
+    with browser.browser_type.launch(executable_path=CHROMIUM, args=[*FLAGS, *WEBGPU]) as other:
+        tab = Tab(other)
+        tab.open(f"{site.url}?renderer={renderer}")
+        hits = tab.value("""(async () => {
+            const {width, height} = nexwarp.canvas, hits = [];
+            for (let y = 8; y < height; y += 16) for (let x = 8; x < width; x += 16) {
+                const hit = await nexwarp.renderer.pick(x, y);
+                if (hit) hits.push([x, y, ...hit.position]);
+            }
+            return hits;
+        })()""")
+        x, y, *position = max(hits, key=lambda hit: abs(hit[0] - 100) + abs(hit[1] - 75))
+        tab.page.mouse.dblclick(x, y)
+        # Picking waits for a frame, so the flight to the surfel may begin later.
+        target = "(p => p.eye.map((x, i) => x + p.distance * p.axes().forward[i]))(nexwarp.pose)"
+        tab.wait(f"Math.hypot(...{target}.map((x, i) => x - {position}[i])) < 0.01 * Math.hypot(...{position})")
+        assert not tab.errors
+
+
 def test_touch_on_a_phone(browser, site):
     tab = Tab(browser, 360, 640, has_touch=True, is_mobile=True, device_scale_factor=1)
     tab.open(site.url)  # no WebGPU in this browser: the page chooses the baked scene

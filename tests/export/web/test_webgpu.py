@@ -143,7 +143,7 @@ def test_the_canvas_shows_the_model(tab):
     pixels = tab.page.evaluate("[...target.getContext('2d').getImageData(0, 0, 37, 27).data]")
     shown = np.array(pixels, np.float32).reshape(camera.height, camera.width, 4)[..., :3] / 255
     assert np.abs(shown - out["image"].numpy().clip(0, 1)).max() < 1.1 / 255
-    picked = tab.page.evaluate("camera => renderer.pick(18, 13, camera)", entry_of(camera))
+    picked = tab.page.evaluate("renderer.pick(18, 13)")
     assert picked["id"] == out["ids"][13, 18, 0]
     assert picked["depth"] == pytest.approx(expected.depths[13, 18, 0].item(), rel=1e-4)
     assert tab.errors == []

@@ -274,6 +274,7 @@ export class Renderer {
             throw new SceneError(`mode: expected one of ${MODES.join(", ")}, got ${mode}`);
         }
         const start = performance.now();
+        this.camera = camera; // of `pick`
         const full = this.canvas ?? camera;
         const width = Math.max(Math.round(full.width * resolutionScale), 1);
         const height = Math.max(Math.round(full.height * resolutionScale), 1);
@@ -493,7 +494,7 @@ export class Renderer {
     }
 
     // What the last frame shows at a pixel of the canvas: {id, depth, position}, or null.
-    async pick(x, y, camera) {
+    async pick(x, y) {
         await this.chain;
         const hits = this.header.options.max_hits;
         if (this.size === null || hits === 0) {
@@ -509,7 +510,7 @@ export class Renderer {
         if (id < 0) {
             return null;
         }
-        const view = resized(camera, width, height);
+        const view = resized(this.camera, width, height);
         const ray = rayOf(view, column + 0.5, row + 0.5);
         const position = positionOf(view.viewmat).map((x, k) => x + depth * ray[k]);
         return { id, depth, position };
