@@ -15,6 +15,9 @@ ONE_WAY = 0.5  # smallest length of the mean viewing direction for a spiral
 SPREAD = 0.9  # share of the cameras that a spiral spans along each axis
 FRAMES_PER_KEY = 10
 
+LEAST_UP = 1e-3  # length of a mean of upward directions that counts as one
+MEAN_UP_SHARE = 0.01  # weight of that mean beside the right axes
+
 NEIGHBORS = 4  # nearest cameras of a similar direction, from which the neighbour of `between` is drawn
 ALIKE = math.cos(math.radians(60.0))
 BEYOND = 0.5  # how far beyond either camera a new one may lie, as a share of their distance
@@ -23,7 +26,7 @@ RING_WIDTH, RING_HEIGHT = 1280, 720  # pixels, of `surrounding`
 RING_FOV = 0.9  # vertical, radians
 RING_DISTANCE = 3.0  # of the cameras from the middle, in median distances of the points from there
 RING_RISE = 0.3  # height of the ring above the middle, as a fraction of its radius
-RING_UP = (0.0, -1.0, 0.0)  # of most COLMAP models
+UP = (0.0, -1.0, 0.0)  # of most COLMAP models
 
 
 def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
@@ -31,7 +34,7 @@ def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
 
     The ellipse lies in the plane of the two principal axes of the camera centres. Along each axis it spans the 5th to
     the 95th percentile of the centres. It starts at the angle of the first camera. All its cameras look at
-    `focus(cameras)` with the mean up direction; all else is that of the first camera. If the centres lie on a line, the
+    `focus(cameras)`, upright as `up_direction`; all else is that of the first camera. If the centres lie on a line, the
     path runs back and forth along it.
 
     Raises:
@@ -40,7 +43,7 @@ def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     """
     check_range("count", count, 1)
     viewmats, centres = camera_poses(cameras)
-    target, up = focus(cameras), -viewmats[:, 1, :3].mean(0)
+    target, up = focus(cameras), up_direction(cameras)
     if (centres - centres.mean(0)).norm(dim=1).max() <= DEGENERATE * (centres - target).norm(dim=1).max():
         raise ValueError(f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place")
     centre, axes, semi = _fit_ellipse(viewmats, centres)
@@ -56,8 +59,8 @@ def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[
 
     In the frame of the mean camera, the path winds `turns` times around the mean centre and moves forward and back
     once. Its radius along each axis is the distance within which 90 % of the cameras lie. All its cameras look at
-    `focus(cameras)`, or along the mean viewing direction if the focus is not in front of all cameras; up is the mean up
-    direction. All else is that of the first camera.
+    `focus(cameras)`, or along the mean viewing direction if the focus is not in front of all cameras, upright as
+    `up_direction`. All else is that of the first camera.
 
     Raises:
         ValueError: cameras that do not face one way or share one centre; `count` or `turns` < 1.
@@ -65,14 +68,14 @@ def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[
     check_range("count", count, 1)
     check_range("turns", turns, 1)
     viewmats, centres = camera_poses(cameras)
-    forward, down = viewmats[:, 2, :3].mean(0), viewmats[:, 1, :3].mean(0)
+    forward, up = viewmats[:, 2, :3].mean(0), up_direction(cameras)
     if forward.norm() < ONE_WAY:
         raise ValueError(
             f"cameras: expected cameras that face one way, got a mean direction of length {forward.norm().item():.2f} "
             f"(at least {ONE_WAY}); an ellipse suits cameras all around"
         )
     centre = centres.mean(0)
-    axes = look_at(centre, centre + forward, -down)[:3, :3]
+    axes = look_at(centre, centre + forward, up)[:3, :3]
     radii = torch.quantile(((centres - centre) @ axes.T).abs(), SPREAD, dim=0)
     if radii.max() == 0.0:
         raise ValueError(f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place")
@@ -82,7 +85,7 @@ def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[
     first = cameras[0]
     path: list[Camera] = []
     for position in centre + rounds * radii @ axes:
-        viewmat = look_at(position, position + forward if target is None else target, -down)
+        viewmat = look_at(position, position + forward if target is None else target, up)
         path.append(replace(first, viewmat=viewmat.to(first.viewmat)))
     return path
 
@@ -159,7 +162,7 @@ def surrounding(points: torch.Tensor, near: float, count: int = 12) -> list[Came
     middle = positions.median(dim=0).values if len(positions) else torch.zeros(3, dtype=torch.float64)
     spread = (positions - middle).norm(dim=1).median().item() if len(positions) else 1.0
     radius = RING_DISTANCE * (spread or 1.0)
-    up = torch.tensor(RING_UP, dtype=torch.float64)
+    up = torch.tensor(UP, dtype=torch.float64)
     focal = 0.5 * RING_HEIGHT / math.tan(0.5 * RING_FOV)
     K = torch.tensor([[focal, 0.0, RING_WIDTH / 2], [0.0, focal, RING_HEIGHT / 2], [0.0, 0.0, 1.0]])
     cameras: list[Camera] = []
@@ -201,6 +204,27 @@ def with_pose(camera: Camera, rotation: torch.Tensor, position: torch.Tensor) ->
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ position
     return replace(camera, viewmat=viewmat.to(camera.viewmat))
+
+
+def up_direction(cameras: Sequence[Camera]) -> torch.Tensor:
+    """Upward direction of a scene in its world, (3,) float64 of length 1.
+
+    People tilt cameras more than they roll them, so it is the direction most perpendicular to the cameras' right axes.
+    The mean of their upward directions counts a little: it decides where all right axes are alike. -y if that mean is
+    zero, and without cameras.
+    """
+    fallback = torch.tensor(UP, dtype=torch.float64)
+    if not cameras:
+        return fallback
+    viewmats, _ = camera_poses(cameras)
+    mean_up = -viewmats[:, 1, :3].mean(0)
+    if mean_up.norm() < LEAST_UP:
+        return fallback
+    mean_up = mean_up / mean_up.norm()
+    rights = viewmats[:, 0, :3]
+    across = torch.eye(3, dtype=torch.float64) - mean_up[:, None] * mean_up
+    up = torch.linalg.eigh(rights.mT @ rights / len(cameras) + MEAN_UP_SHARE * across).eigenvectors[:, 0]
+    return up if up @ mean_up > 0.0 else -up
 
 
 def camera_poses(cameras: Sequence[Camera]) -> tuple[torch.Tensor, torch.Tensor]:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.cameras.paths import focus
+from nexwarp.cameras.paths import focus, up_direction
 from nexwarp.viewer.pacing import MOST_SIDE
 
 # The browser moves two units a second, so that it crosses a scene of this radius in three seconds.
@@ -21,7 +21,6 @@ MOST_COMPARED = 300  # cameras, for the first view
 FRUSTUM_SHARE = 0.4  # size of a frustum, in distances of neighbouring cameras
 SMALLEST_FRUSTUM, LARGEST_FRUSTUM = 0.02, 0.16  # browser units; all cameras lie within RADIUS of the origin
 BAND_ROWS = 16  # rows of a tile
-UP = np.array([0.0, -1.0, 0.0])  # where the cameras do not say
 
 FloatVector: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
 
@@ -49,8 +48,7 @@ class World:
         middle = means.detach().double().median(dim=0).values.cpu().numpy() if len(means) else centre
         away = np.linalg.norm(middle - centre)
         radius = radius if radius > 1e-6 * away else away  # of cameras at one place
-        up = -poses[:, :3, 1].mean(axis=0)
-        up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else UP
+        up = up_direction(cameras).numpy()
         try:
             target = focus(cameras).numpy()
         except ValueError:  # parallel axes

@@ -2,12 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from nexwarp.cameras.camera import Camera, reduced, resized
-from nexwarp.cameras.paths import between, ellipse, focus, interpolate, look_at, spiral
+from nexwarp.cameras.paths import between, ellipse, focus, interpolate, look_at, spiral, up_direction
 from tests.tolerances import assert_close
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -55,7 +56,7 @@ def test_focus_is_where_the_axes_meet() -> None:
 
 def test_every_camera_looks_at_the_focus_upright() -> None:
     cameras = ring()
-    up = -torch.stack([each.viewmat[1, :3] for each in cameras]).mean(0)
+    up = up_direction(cameras)
     for each in ellipse(cameras, 30):
         x, y, depth = INTRINSICS @ (each.viewmat[:3, :3] @ focus(cameras) + each.viewmat[:3, 3])
         assert depth > 1.0
@@ -81,6 +82,21 @@ def test_path_is_an_ellipse_through_the_cameras_region() -> None:
         low, high = torch.quantile(given[:, axis], torch.tensor([0.05, 0.95]).double())
         assert path[:, axis].max().item() == pytest.approx(high.item(), abs=0.15)
         assert path[:, axis].min().item() == pytest.approx(low.item(), abs=0.15)
+
+
+def test_up_is_across_the_right_axes_however_cameras_are_tilted() -> None:
+    """Half of a ring looks down from above, as people do: the mean of the upward directions leans."""
+    places = [torch.tensor([math.cos(a), math.sin(a), 0.7]) * 3.0 for a in np.linspace(0.0, math.pi, 12)]
+    tilted = [camera(place, torch.zeros(3)) for place in places]
+    mean = -torch.stack([each.viewmat[1, :3] for each in tilted]).mean(0)
+    assert mean @ UP / mean.norm() < math.cos(math.radians(10.0))
+    for motion in (similarity(1.0), similarity(3.0)):
+        up = up_direction([moved(each, motion) for each in tilted])
+        assert up @ (motion[0] @ UP) > math.cos(math.radians(1.0))
+    # Of cameras that all look one way, the right axes say nothing about the tilt: the mean of their own directions.
+    alike = [camera(torch.tensor([x, 0.0, 0.0]), torch.tensor([x, 4.0, 0.0])) for x in (-1.0, 0.0, 1.0)]
+    assert up_direction(alike) @ UP > 1 - 1e-9
+    assert up_direction([]).tolist() == [0.0, -1.0, 0.0]
 
 
 def test_an_upright_wall_of_cameras_gives_an_upright_ellipse() -> None:

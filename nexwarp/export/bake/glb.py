@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.cameras.paths import camera_poses
+from nexwarp.cameras.paths import up_direction
 from nexwarp.errors import FormatError, SettingError
 from nexwarp.export.bake.baked import Baked, mean_colors
 from nexwarp.export.bake.layout import Layout, lay_out
@@ -70,9 +70,8 @@ def check_package() -> None:
 
 
 def upright(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the rotation (3, 3) of the world that turns the mean of the cameras' upward directions to +y."""
-    up = -camera_poses(cameras)[0][:, 1, :3].mean(0).numpy()
-    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, -1.0, 0.0])
+    """Return the rotation (3, 3) of the world that turns the scene's upward direction to +y."""
+    up = up_direction(cameras).numpy()
     side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     side /= np.linalg.norm(side)
     return np.stack([side, up, np.cross(side, up)])

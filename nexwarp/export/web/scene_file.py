@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.cameras.paths import camera_poses, focus
+from nexwarp.cameras.paths import camera_poses, focus, up_direction
 from nexwarp.errors import FormatError, SettingError
 from nexwarp.export.web.quantise import CHUNK, encode_levels, quantised
 from nexwarp.export.web.scene_data import SceneData, array_of
@@ -132,11 +132,10 @@ def scene_header(scene: SceneData, cameras: Mapping[str, Camera], title: str) ->
 
 def _surroundings(cameras: Sequence[Camera], middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the point to orbit around, and the upward direction."""
+    up = up_direction(cameras).numpy()
     if not cameras:
-        return middle, np.array([0.0, -1.0, 0.0])
+        return middle, up
     viewmats, _ = camera_poses(cameras)
-    up = -viewmats[:, 1, :3].mean(0).numpy()
-    up = up / max(float(np.linalg.norm(up)), 1e-9)
     try:
         center = focus(cameras)
     except ValueError:  # parallel axes
