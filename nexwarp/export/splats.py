@@ -16,6 +16,8 @@ from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN
 
 SPACING = 1.4  # between neighbouring pieces, in their standard deviations: leaves a ripple below 2 %
 MOST_STEPS = 16  # pieces on either side of a surfel's centre, along one axis
+FEWEST_STEPS = 3  # a coarser grid would be one Gaussian that is larger than the surfel
+MOST_PIECES, PIECES_EACH = 50_000, 16  # in all, and more for each surfel, before grids get coarser
 LEVELS = 128  # opacities that grids are fitted for; other opacities scale the nearest grid
 FITTING_STEPS = 40
 WIDTHS = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7)  # candidates of a row of pieces, in standard deviations of the surfel
@@ -39,7 +41,7 @@ def split_large(
     """Split surfels of which a scale is above `max_extent` of their distance to a camera. Gamma is taken as 1.
 
     Takes centres (N, 3), standard deviations (N, 2) and opacities (N,). Returns the surfels that are small enough, in
-    order, then the pieces of the others.
+    order, then the pieces of the others; where these are very many, in coarser grids.
     """
     limit = means.new_full((len(means),), math.inf)
     for camera in cameras:
@@ -48,9 +50,13 @@ def split_large(
     peak = opacities.clamp(max=ALPHA_MAX)
     level = (peak * LEVELS).round().clamp(1, LEVELS - 1)
     reach = _reach(level / LEVELS)
-    steps = (reach[:, None] * scales / (SPACING * limit[:, None])).ceil().clamp(0, MOST_STEPS)
-    steps = torch.where(scales > limit[:, None], steps.clamp(min=1), torch.zeros_like(steps)).long()
-    whole = (steps == 0).all(dim=1) | (peak < ALPHA_MIN)
+    wanted = (reach[:, None] * scales / (SPACING * limit[:, None])).ceil().clamp(1, MOST_STEPS)
+    wanted = torch.where((scales > limit[:, None]) & (peak >= ALPHA_MIN)[:, None], wanted, 0.0).long()
+    most, steps = MOST_STEPS, wanted
+    while most > FEWEST_STEPS and int((2 * steps + 1).prod(dim=1).sum()) > MOST_PIECES + PIECES_EACH * len(steps):
+        most -= 1
+        steps = wanted.clamp(max=most)
+    whole = (steps == 0).all(dim=1)
     ids = [whole.nonzero()[:, 0]]
     offsets, sizes, alphas = [means.new_zeros(len(ids[0]), 2)], [scales[whole]], [opacities[whole]]
     large = (~whole).nonzero()[:, 0]

@@ -58,14 +58,14 @@ def baked(model, cameras) -> Baked:
 def test_no_texel_has_two_owners(baked):
     layout = baked.layout
     owners = torch.zeros(layout.height, layout.width, dtype=torch.long)
-    places, ids, _ = layout.centres()
+    ((places, ids, _),) = layout.centres()
     owners.index_put_((places[:, 1], places[:, 0]), torch.ones(len(ids), dtype=torch.long), accumulate=True)
     assert owners.max() == 1 and owners[0].sum() == 0, "the first row is that of surfels without a texture"
     assert owners.sum() == len(ids) > 0
 
 
 def test_texels_lie_where_sampling_looks_for_them(baked):
-    places, ids, local = baked.layout.centres()
+    ((places, ids, local),) = baked.layout.centres()
     assert_close(baked.layout.texels(ids, local), places.float(), kind="value", name="places")
     # Beyond its box a surfel has the colours of the box's side.
     beyond = baked.layout.texels(ids, local + 100.0)
@@ -162,12 +162,35 @@ def test_the_gltf_file_holds_the_surfels(baked, cameras, tmp_path):
     assert material["alphaMode"] == "MASK" and "KHR_materials_unlit" in material["extensions"]
 
 
-def test_spz_files_hold_the_gaussians(model, tmp_path):
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 3e4])
+def test_spz_files_hold_the_gaussians(model, tmp_path, unit):
+    """In scenes of any size."""
     library = pytest.importorskip("gaussforge").GaussForge()
-    save_splats_spz(tmp_path / "a.spz", model.surfels)
+    surfels = copy.deepcopy(model.surfels)
+    with torch.no_grad():
+        surfels.means *= unit
+        surfels.log_scales.clamp_(-9.9, 5.9)
+    save_splats_spz(tmp_path / "a.spz", surfels)
     found = library.read((tmp_path / "a.spz").read_bytes(), "spz")["data"]
     positions, colors, alphas = (np.frombuffer(found[name], np.float32) for name in ("positions", "colors", "alphas"))
-    surfels = model.surfels
-    assert np.abs(positions.reshape(-1, 3) - surfels.means.detach().numpy()).max() <= 2**-12
+    means = surfels.means.detach().numpy()
+    step = max(np.abs(means).max() * 2.0**-22, 2.0**-24)
+    assert np.abs(positions.reshape(-1, 3) - means).max() <= step
     assert np.abs(colors.reshape(-1, 3) - surfels.sh0[:, 0].detach().numpy()).max() < 0.02
     assert np.abs(1 / (1 + np.exp(-alphas)) - surfels.opacities.detach().numpy()).max() < 1 / 255
+
+
+def test_what_spz_cannot_hold_is_said(model, tmp_path):
+    pytest.importorskip("gaussforge")
+    surfels = copy.deepcopy(model.surfels)
+    with torch.no_grad():
+        surfels.log_scales.fill_(-12.0)
+    with pytest.warns(UserWarning, match=r"SPZ holds scales from 4.5e-05 to 379 units; .* change their size"):
+        save_splats_spz(tmp_path / "a.spz", surfels)
+    empty = nw.Surfels.from_activated(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (2,), (), (2,), (16, 3))))
+    with pytest.raises(ValueError, match="expected surfels to write, the model has none"):
+        save_splats_spz(tmp_path / "b.spz", empty)
+    with torch.no_grad():
+        surfels.means[:] *= 1e9
+    with pytest.raises(ValueError, match="SPZ holds Gaussians up to 8,384,512 units from the origin"):
+        save_splats_spz(tmp_path / "b.spz", surfels)

@@ -147,6 +147,13 @@ def test_small_surfels_and_those_of_no_camera_stay_one_gaussian(tmp_path: Path) 
         save_splats_ply(tmp_path / "bad.ply", surfels, cameras=[camera], max_extent=0)
 
 
+def test_huge_surfels_do_not_become_a_flood() -> None:
+    camera = nw.Camera(torch.eye(4), intrinsics(50, 50, 32, 24).float(), 64, 48)
+    means = torch.rand(900, 3) + torch.tensor([0.0, 0.0, 2.0])
+    pieces = split_large(means, torch.full((900, 2), 80.0).exp(), torch.full((900,), 0.9), [camera], 0.3)
+    assert 900 < len(pieces.ids) <= 50_000 + 16 * 900 and len(pieces.ids.unique()) == 900
+
+
 def test_an_affine_renderer_shows_large_surfels_as_we_do(tmp_path: Path) -> None:
     """A floor that runs up to the camera: one Gaussian each it is another picture, split it is ours to 35 dB."""
     x, z = (

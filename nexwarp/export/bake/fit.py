@@ -41,21 +41,27 @@ def evaluate(model: Model, seen: Observations, layout: Layout) -> torch.Tensor:
     What is added to a plain colour is weighted by the fraction of the surfel that is textured.
     """
     atlas = model.surfels.means.new_zeros(layout.height, layout.width, 3)
-    places, ids, local = layout.centres()
-    if model.texture is None or model.options.max_hits == 0 or not len(ids):
+    if model.texture is None or model.options.max_hits == 0:
         return atlas
     surfels, degree = model.surfels, model.options.sh_degree
-    offsets = (local * surfels.scales[ids]).unbind(1)
-    points = surfels.means[ids] + sum(x[:, None] * axis[ids] for x, axis in zip(offsets, axes(surfels), strict=True))
+    plain = None if model.texture.residual else mean_colors(surfels, seen, degree)
     # A pixel of the closest view, in world units: levels of finer cells fade as they do there.
-    sizes = (surfels.scales / seen.pixels.clamp_min(1e-12)).amin(1)[ids]
-    directions = seen.directions[ids]
-    colors = model.texture.colors(
-        points[:, None], sizes[:, None], directions, 1.0, sh_degree=degree, clamp=model.options.clamp_texture
-    )[:, 0]
-    if not model.texture.residual:
-        colors = colors - mean_colors(surfels, seen, degree)[ids]
-    atlas[places[:, 1], places[:, 0]] = seen.textured[ids, None] * colors
+    sizes = (surfels.scales / seen.pixels.clamp_min(1e-12)).amin(1)
+    for places, ids, local in layout.centres():
+        offsets = (local * surfels.scales[ids]).unbind(1)
+        sides = axes(surfels)
+        points = surfels.means[ids] + sum(x[:, None] * axis[ids] for x, axis in zip(offsets, sides, strict=True))
+        colors = model.texture.colors(
+            points[:, None],
+            sizes[ids, None],
+            seen.directions[ids],
+            1.0,
+            sh_degree=degree,
+            clamp=model.options.clamp_texture,
+        )[:, 0]
+        if plain is not None:
+            colors = colors - plain[ids]
+        atlas[places[:, 1], places[:, 0]] = seen.textured[ids, None] * colors
     return atlas
 
 

@@ -86,14 +86,14 @@ def _texture(baked: Baked) -> tuple[Layout, np.ndarray]:
     reach = (2 * (opacities / LEAST_ALPHA).clamp_min(1).log())[:, None].pow(0.5 / gammas)
     boxes = torch.cat([-reach, reach], dim=1)
     layout = lay_out(boxes, visible, baked.seen.pixels, fewest=FEWEST)
-    places, ids, local = layout.centres()
     plain = mean_colors(surfels, baked.seen, baked.model.options.sh_degree)
-    colors = plain[ids] + baked.added(ids, local)
-    exponent = local.square().clamp_min(1e-20).pow(gammas[ids]).sum(1)
-    alphas = (surfels.opacities[ids] * torch.exp(-0.5 * exponent)).clamp(max=ALPHA_MAX)
     pixels = np.zeros((layout.height, layout.width, 4), np.uint8)
-    columns, rows = places.cpu().numpy().T
-    pixels[rows, columns] = to_uint8(torch.cat([colors, alphas[:, None]], dim=1)).cpu().numpy()
+    for places, ids, local in layout.centres():
+        colors = plain[ids] + baked.added(ids, local)
+        exponent = local.square().clamp_min(1e-20).pow(gammas[ids]).sum(1)
+        alphas = (surfels.opacities[ids] * torch.exp(-0.5 * exponent)).clamp(max=ALPHA_MAX)
+        columns, rows = places.cpu().numpy().T
+        pixels[rows, columns] = to_uint8(torch.cat([colors, alphas[:, None]], dim=1)).cpu().numpy()
     return layout, pixels
 
 

@@ -1,6 +1,7 @@
 """Where each surfel's texels lie in the atlas."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -8,6 +9,7 @@ import torch
 MAX_SIDE = 256  # texels of one surfel along one axis
 FILLED = 0.85  # fraction of the atlas that rectangles cover at most: packing leaves gaps
 BISECTIONS = 24
+TEXELS_AT_A_TIME = 2**20
 LARGEST_TEXEL = 1e6  # pixels
 GROWTH = 1.2
 
@@ -38,9 +40,17 @@ class Layout:
         share = (local - boxes[..., :2]) / (boxes[..., 2:] - boxes[..., :2]).clamp_min(1e-12)
         return rects[..., :2] + share.clamp(0, 1) * (rects[..., 2:] - 1)
 
-    def centres(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return the M texels: places (M, 2) int64, column and row; surfels (M,) int64; coordinates (M, 2) on them."""
+    def centres(self) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+        """Yield the texels, about a million at a time, as an atlas has up to 16 million.
+
+        Places (M, 2) int64, column and row; surfels (M,) int64; coordinates (M, 2) on them.
+        """
         textured = self.textured()
+        part = self.rects[textured, 2:].long().prod(1).cumsum(0) // TEXELS_AT_A_TIME
+        for members in textured.split(part.unique_consecutive(return_counts=True)[1].tolist()):
+            yield self._centres(members)
+
+    def _centres(self, textured: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         rects, boxes = self.rects[textured].long(), self.boxes[textured]
         counts = rects[:, 2] * rects[:, 3]
         owner = torch.arange(len(textured), device=rects.device).repeat_interleave(counts)
