@@ -19,22 +19,21 @@ import warp as wp
 import nexwarp.kernels
 from nexwarp.kernels.types import MAX_HITS, types
 
-# What the factories in nexwarp.kernels are called with, by the name of their parameters.
+# What the factories in nexwarp.kernels are called with, by the name of their parameters: each of their branches.
 VALUES: dict[str, tuple[Any, ...]] = {
     "real": (wp.float32,),
     "storage": (wp.float16,),
     "dtype": (wp.float32, types(wp.float32).vec3, types(wp.float32).vec4),
-    "max_hits": (0, 1, 2, MAX_HITS),
-    "degree": (0, 1, 2, 3),
-    "features": (1, 2, 4, 8),
+    "max_hits": (0, 2),
+    "degree": (3,),
+    "features": (2, 8),
     "clamp": (False, True),
     "with_errors": (False, True),
     "fixed_point": (False, True),
     "by_place": (False,),  # True is for CPUs
     "wide": (False, True),
 }
-ALL = VALUES | {"max_hits": tuple(range(MAX_HITS + 1))}
-FUSED = VALUES | {"features": (2, 4)}
+ALL = VALUES | {"max_hits": tuple(range(MAX_HITS + 1)), "degree": (0, 1, 2, 3), "features": (1, 2, 4, 8)}
 # Their atomics depend on the architecture.
 ATOMIC = ("hashgrid", "fused_scatter")
 
@@ -49,12 +48,14 @@ def made_by(factory: Any, values: dict[str, tuple[Any, ...]]) -> Iterator[wp.Ker
 
 
 def kernels(choice: str) -> Iterator[wp.Kernel]:
-    """Yield the kernels of the modules of nexwarp.kernels: "all", "usual" (some K), "atomic"."""
+    """Yield the kernels of the modules of nexwarp.kernels: "all", "usual" (one value a branch), "atomic"."""
     for info in pkgutil.iter_modules(nexwarp.kernels.__path__):
         if choice == "atomic" and info.name not in ATOMIC:
             continue
         module = importlib.import_module(f"nexwarp.kernels.{info.name}")
-        values = FUSED if info.name.startswith("fused") else ALL if choice == "all" else VALUES
+        values = ALL if choice == "all" else VALUES
+        if info.name.startswith("fused"):
+            values = values | {"features": tuple(n for n in values["features"] if n in (2, 4))}
         for name, member in vars(module).items():
             if getattr(member, "__module__", None) != module.__name__:
                 continue

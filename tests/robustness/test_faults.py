@@ -79,24 +79,29 @@ def one_line(capsys: pytest.CaptureFixture[str], *words: str) -> None:
     assert all(word in err for word in words), err
 
 
-def every_fault(run: Path, command: list[str]) -> list[Disk]:
-    """Disks that fail one request of a command after the other: a full one all that follow, too."""
+def every_fault(run: Path, command: list[str], both: bool = False) -> list[Disk]:
+    """Disks that fail one request of a command after the other: a full one all that follow, too.
+
+    Full and broken ones take turns; with `both` each request meets both.
+    """
     with failing(Disk(run)) as counted:
         assert cli.main(command) == 0
     places = range(len(counted.requests))
-    return [Disk(run, fatal, number, number == FULL) for fatal in places for number in (FULL, BROKEN)]
+    numbers = {place: (FULL, BROKEN) if both else ((FULL, BROKEN)[place % 2],) for place in places}
+    return [Disk(run, place, number, number == FULL) for place in places for number in numbers[place]]
 
 
 # Training
 
 
-def test_training_survives_every_fault_of_its_disk(trained, scene, tmp_path, capsys):
+@pytest.mark.parametrize("both", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_training_survives_every_fault_of_its_disk(trained, scene, tmp_path, capsys, both):
     """What was saved stays, whatever fails; with --resume, on a disk that works again, the end is the same."""
     expected = (trained / "model.safetensors").read_bytes()
     run = tmp_path / "run"
     command = ["train", str(scene), "--run", str(run), *FLAGS]
-    disks = every_fault(run, command)
-    assert len(disks) > 100
+    disks = every_fault(run, command, both)
+    assert len(disks) > 50
     for disk in disks:
         shutil.rmtree(run, ignore_errors=True)
         capsys.readouterr()
@@ -113,7 +118,7 @@ def test_training_survives_every_fault_of_its_disk(trained, scene, tmp_path, cap
         kept = whole_checkpoints(run)
         saved = [r for r in disk.requests[: disk.fatal] if r == "rename checkpoint"]
         assert len(kept) >= min(len(saved), 2) and (not saved or kept[0] >= len(saved)), where
-        if disk.fatal % 3 == 0 or not kept:
+        if both or disk.fatal % 9 == 0:
             assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, "--resume"]) == 0, where
             assert (run / "model.safetensors").read_bytes() == expected, where
             check_whole(run)
@@ -154,7 +159,7 @@ def test_other_commands_survive_every_fault(trained, tmp_path, capsys, arguments
     command = [argument.format(run=run) for argument in arguments]
     before = files(run)
     disks = every_fault(run, command)
-    assert len(disks) >= 8
+    assert len(disks) >= 4
     after = files(run)
     for disk in disks:
         shutil.rmtree(run)
