@@ -30,6 +30,9 @@ class Camera:
         width: image width in pixels.
         height: image height in pixels.
         near: hits with a z-depth of at most this are ignored, world units.
+        origin: world coordinates of the origin of the frame that `viewmat` maps from: (0, 0, 0) for the world frame
+            itself. None is the frame of the surfels that the camera renders. A model far from its world's origin, as
+            with georeferenced coordinates, has a frame of its own, since float32 would round its coordinates.
         fx, fy, cx, cy: focal lengths and principal point in pixels, the numbers in `K`.
 
     Args:
@@ -48,6 +51,7 @@ class Camera:
     width: int
     height: int
     near: float = 0.01
+    origin: tuple[float, float, float] | None = field(default=None, kw_only=True)
     checked: InitVar[tuple[float, float, float, float] | None] = field(default=None, kw_only=True)
     fx: float = field(init=False)
     fy: float = field(init=False)
@@ -119,7 +123,22 @@ class Camera:
 
     def to(self, *args: Any, **kwargs: Any) -> "Camera":
         """Return a copy with `viewmat` and `K` moved or converted; arguments as of `torch.Tensor.to`."""
-        return Camera(self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs), self.width, self.height, self.near)
+        matrices = (self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs))
+        return Camera(*matrices, self.width, self.height, self.near, origin=self.origin)
+
+    def moved(self, origin: tuple[float, float, float]) -> "Camera":
+        """Return the same camera in the frame with another origin in world coordinates, computed in float64.
+
+        Raises:
+            ValueError: the camera has no origin of its own.
+        """
+        if self.origin is None:
+            raise ValueError("origin: expected the world coordinates of the camera's frame, got None")
+        viewmat = self.viewmat.double()
+        way = viewmat.new_tensor([new - old for new, old in zip(origin, self.origin, strict=True)])
+        shift = viewmat[:3, 3] + (viewmat[:3, :3] * way).sum(1)
+        moved = torch.cat([torch.cat([viewmat[:3, :3], shift[:, None]], 1), viewmat[3:]]).to(self.viewmat.dtype)
+        return replace(self, viewmat=moved, origin=origin, checked=(self.fx, self.fy, self.cx, self.cy))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from nexwarp.cameras.camera import MAX_CAMERAS, Camera
+from nexwarp.cameras.camera import LARGEST_DISTANCE, MAX_CAMERAS, Camera
 from nexwarp.errors import FormatError, MissingError, check_range, check_version
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import READ_ERRORS, read_json, write_json
@@ -15,6 +15,7 @@ from nexwarp.io.json_files import READ_ERRORS, read_json, write_json
 CAMERAS_FILE = "cameras.json"
 CAMERAS_VERSION = 1  # of the file; one without `format_version` has version 1
 SETS = ("train", "test")
+WORLD = (0.0, 0.0, 0.0)
 
 
 def save_cameras(
@@ -22,18 +23,24 @@ def save_cameras(
     cameras: Mapping[str, Mapping[str, Camera]],
     before: Mapping[str, Mapping[str, Camera]] | None = None,
 ) -> None:
-    """Write cameras as JSON: set ("train", "test") -> name -> camera.
+    """Write cameras as JSON: set ("train", "test") -> name -> camera, and `origin` of their frame where it has one.
 
     `before` are the same cameras before their poses were refined; those that differ are written, too.
     """
-    data: dict[str, dict[str, dict[str, object]]] = {}
+    data: dict[str, Any] = {}
+    origins = {camera.origin or WORLD for members in cameras.values() for camera in members.values()}
+    if len(origins) > 1:
+        raise ValueError(f"cameras: expected one origin, got {len(origins)}")
+    if origins - {WORLD}:
+        data["origin"] = list(*origins)
     for group, members in cameras.items():
         data[group] = {}
         for name, camera in members.items():
-            entry = data[group][name] = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
+            entry: dict[str, Any] = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
             entry |= {"width": camera.width, "height": camera.height, "near": camera.near}
             if before is not None and not torch.equal(before[group][name].viewmat.cpu(), camera.viewmat.cpu()):
                 entry["given_viewmat"] = before[group][name].viewmat.tolist()
+            data[group][name] = entry
     write_json(path, data)
 
 
@@ -44,7 +51,8 @@ def load_cameras(path: str | os.PathLike[str]) -> dict[str, dict[str, Camera]]:
         path: a run folder, or its `cameras.json`.
 
     Returns:
-        Set ("train", "test") -> name of the photo -> camera, float32 on the CPU.
+        Set ("train", "test") -> name of the photo -> camera, float32 on the CPU, in the model's frame; `Camera.origin`
+        says where that lies in the world, where it is not the world frame itself.
 
     Raises:
         FileNotFoundError: no such file.
@@ -60,8 +68,9 @@ def load_cameras(path: str | os.PathLike[str]) -> dict[str, dict[str, Camera]]:
         if data and not groups:
             raise ValueError(f"expected {' or '.join(SETS)}, found neither")
         check_range("number of cameras", sum(len(members) for members in groups.values()), 0, MAX_CAMERAS)
+        origin = origin_of(data)
         return {
-            group: {_file_name(name): _camera(entry) for name, entry in members.items()}
+            group: {_file_name(name): _camera(entry, origin) for name, entry in members.items()}
             for group, members in groups.items()
         }
     except FileNotFoundError:
@@ -77,6 +86,22 @@ def _file_name(name: str) -> str:
     return name
 
 
-def _camera(entry: dict[str, Any]) -> Camera:
+def origin_of(data: Mapping[str, Any]) -> tuple[float, float, float] | None:
+    """Read the key `origin` of a model's or a file's frame; None where there is none.
+
+    Raises:
+        ValueError: it is not three finite numbers.
+    """
+    values = data.get("origin")
+    if values is None:
+        return None
+    numbers = isinstance(values, list) and all(type(value) in (int, float) for value in values)
+    if not numbers or len(values) != 3 or not all(abs(value) <= LARGEST_DISTANCE for value in values):
+        raise ValueError(f"origin: expected three numbers, got {one_line(values, 60)}")
+    x, y, z = map(float, values)
+    return x, y, z
+
+
+def _camera(entry: dict[str, Any], origin: tuple[float, float, float] | None) -> Camera:
     viewmat, K = torch.tensor(entry["viewmat"]), torch.tensor(entry["K"])
-    return Camera(viewmat, K, entry["width"], entry["height"], near=entry["near"])
+    return Camera(viewmat, K, entry["width"], entry["height"], near=entry["near"], origin=origin)

@@ -1,8 +1,8 @@
 """Read and write cameras as nerfstudio's JSON: `transforms.json` of a scene, and camera paths of its viewer.
 
 Their matrices are camera to world with x right, y up, z backward (OpenGL); nexwarp's are world to camera with x right,
-y down, z forward. The world frame is that of the file; the `applied_transform` and `applied_scale` of a transforms.json
-are inverted.
+y down, z forward. The world frame is that of the file, in float64; the `applied_transform` and `applied_scale` of a
+transforms.json are inverted. Cameras of a model with a frame of its own (`Camera.origin`) are moved to and from it.
 """
 
 import json
@@ -16,6 +16,7 @@ from typing import cast
 import torch
 
 from nexwarp.cameras.camera import MAX_CAMERAS, Camera
+from nexwarp.cameras.cameras_file import WORLD
 from nexwarp.errors import FormatError, MissingError
 from nexwarp.io.files import one_line, write_atomically
 from nexwarp.io.json_files import Json, JsonObject, read_object
@@ -71,7 +72,9 @@ def save_transforms(
     write_atomically(Path(path), (json.dumps(data, indent=2) + "\n").encode())
 
 
-def load_transforms(path: str | os.PathLike[str], near: float = 0.01) -> dict[str, Camera]:
+def load_transforms(
+    path: str | os.PathLike[str], near: float = 0.01, origin: tuple[float, float, float] = WORLD
+) -> dict[str, Camera]:
     """Read the cameras of a `transforms.json` as pinhole cameras; distortion coefficients are ignored.
 
     The images need not exist. Intrinsics are those of the frame, else those of the file: `fl_x`, `fl_y` or
@@ -80,6 +83,7 @@ def load_transforms(path: str | os.PathLike[str], near: float = 0.01) -> dict[st
     Args:
         path: the file.
         near: near depth of the cameras, world units.
+        origin: world coordinates of the origin of the frame to return cameras in, such as `Model.origin`.
 
     Returns:
         Name of the image file -> camera, float32 on the CPU, in the order of the file.
@@ -89,7 +93,7 @@ def load_transforms(path: str | os.PathLike[str], near: float = 0.01) -> dict[st
             frame and key.
     """
     path = Path(path)
-    return _frames(path, _read(path), near)
+    return _frames(path, _read(path), near, origin)
 
 
 def save_camera_path(path: str | os.PathLike[str], cameras: Sequence[Camera], fps: float = 30.0) -> None:
@@ -139,12 +143,15 @@ def save_camera_path(path: str | os.PathLike[str], cameras: Sequence[Camera], fp
     write_atomically(Path(path), (json.dumps(data, indent=2) + "\n").encode())
 
 
-def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> CameraPath:
+def load_camera_path(
+    path: str | os.PathLike[str], near: float = 0.01, origin: tuple[float, float, float] = WORLD
+) -> CameraPath:
     """Read a camera path: nerfstudio's (key `camera_path`), or the frames of a `transforms.json` in their order.
 
     Args:
         path: the file.
         near: near depth of the cameras, world units.
+        origin: see `load_transforms`.
 
     Raises:
         FileNotFoundError: no such file. ValueError: a key is missing or has an invalid value; the message names the
@@ -154,7 +161,7 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
     data = _read(path)
     if "camera_path" not in data:
         if "frames" in data:
-            return CameraPath(list(_frames(path, data, near).values()), None)
+            return CameraPath(list(_frames(path, data, near, origin).values()), None)
         keys = ", ".join(sorted(data)[:8]) or "none"
         raise FormatError(f"{path}: expected the key camera_path or frames, found {one_line(keys)}")
     if data.get("camera_type", "perspective") != "perspective":
@@ -171,11 +178,11 @@ def load_camera_path(path: str | os.PathLike[str], near: float = 0.01) -> Camera
             fov = number_of(where, entry, "fov", above=0.0, below=180.0)
             fx = fy = height / (2 * math.tan(math.radians(fov) / 2))
             cx, cy = width / 2, height / 2
-        cameras.append(_camera(where, pose, (fx, fy, cx, cy), (width, height), near))
+        cameras.append(_camera(where, pose, (fx, fy, cx, cy), (width, height), near, origin))
     return CameraPath(cameras, fps)
 
 
-def _frames(path: Path, data: JsonObject, near: float) -> dict[str, Camera]:
+def _frames(path: Path, data: JsonObject, near: float, origin: tuple[float, float, float]) -> dict[str, Camera]:
     model = data.get("camera_model", "PINHOLE")
     if model not in PINHOLES:
         raise FormatError(f"{path}: camera_model: expected one of {', '.join(PINHOLES)}, got {model!r:.60}")
@@ -194,13 +201,16 @@ def _frames(path: Path, data: JsonObject, near: float) -> dict[str, Camera]:
         name = one_line(frame.get("file_path", f"{i:04d}"))
         if name in cameras:
             raise ValueError(f"{where}.file_path: expected a name of its own, got {name!r} again")
-        cameras[name] = _camera(where, undo @ pose, intrinsics, (width, height), near)
+        cameras[name] = _camera(where, undo @ pose, intrinsics, (width, height), near, origin)
     return cameras
 
 
 def _camera_to_world(camera: Camera) -> torch.Tensor:
-    """(4, 4) float64 on the CPU; inverted, not transposed, as a float32 rotation is orthonormal to 1e-7 only."""
-    return torch.linalg.inv(camera.viewmat.detach().double().cpu()) @ FLIP
+    """(4, 4) float64 on the CPU, to the world frame."""
+    # Not transposed: a float32 rotation is orthonormal to 1e-7 only.
+    pose = torch.linalg.inv(camera.viewmat.detach().double().cpu())
+    pose[:3, 3] += pose.new_tensor(camera.origin or WORLD)
+    return pose @ FLIP
 
 
 def _intrinsics(camera: Camera) -> dict[str, float]:
@@ -240,12 +250,19 @@ def merged(frame: Mapping[str, Json], file: Mapping[str, Json]) -> JsonObject:
 
 
 def _camera(
-    where: str, pose: torch.Tensor, intrinsics: tuple[float, ...], size: tuple[int, int], near: float
+    where: str,
+    pose: torch.Tensor,
+    intrinsics: tuple[float, ...],
+    size: tuple[int, int],
+    near: float,
+    origin: tuple[float, float, float],
 ) -> Camera:
     fx, fy, cx, cy = intrinsics
     K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    pose = pose @ FLIP
+    pose[:3, 3] -= pose.new_tensor(origin)
     try:
-        return Camera(torch.linalg.inv(pose @ FLIP).float(), K, *size, near)
+        return Camera(torch.linalg.inv(pose).float(), K, *size, near, origin=origin)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 

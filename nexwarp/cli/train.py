@@ -281,7 +281,7 @@ class Train:
                 scene.train[0].camera.near, record.source.name, self.host, self.port, record.config.iterations
             ),
             photos={f"{group}/{v.name}": partial(getattr, v, "image") for group, views in sets.items() for v in views},
-            save_path=partial(keep_camera_path, run),
+            save_path=partial(keep_camera_path, run, origin=scene.train[0].camera.origin),
         )
         print_url(viewer, console)
         return viewer

@@ -39,7 +39,7 @@ class ViewCommand:
             lambda: model,
             opened.cameras,
             ViewerOptions(near_depth(model), opened.title, self.host, self.port),
-            save_path=partial(keep_camera_path, opened.folder, opened=self.run),
+            save_path=partial(keep_camera_path, opened.folder, opened=self.run, origin=model.origin),
         ) as viewer:
             show_until_interrupted(viewer, console)
 

@@ -1,5 +1,7 @@
 """The content of a scene's files without pixels: photos with their cameras, and points."""
 
+import dataclasses
+import math
 import os
 import unicodedata
 import warnings
@@ -7,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +20,8 @@ from nexwarp.io.files import one_line
 MAX_PART, MAX_PATH = 240, 1024  # bytes of a part of a file's path, and of the path
 PICTURES = frozenset(f".{name}" for name in "jpg jpeg png webp tif tiff bmp ppm pgm pnm gif tga jp2 j2k avif".split())
 MOST_NAMED = 100  # missing photos in a message
+LOST_PIXELS = 0.01  # by single precision, from which on a scene gets a frame of its own
+DEPTH_SAMPLES = 2000  # points from which the depth of a scene is estimated
 LARGEST_COORDINATE = 1e15  # its square is finite in single precision
 
 
@@ -27,7 +32,7 @@ class Photo:
     Attributes:
         name: path below the images folder, with "/" as separator; unique in a scene.
         file: the image file.
-        viewmat: (4, 4) float64, world to camera, OpenCV axes.
+        viewmat: (4, 4) float64, world to camera, OpenCV axes; the "world" of a capture's photos has its `origin`.
         lens: the camera of the photo; the size of the image file may differ from the lens's by a factor.
         mask: the mask's file; None if the scene names none.
         face: name of the face of a panorama, a key of `nexwarp.data.lens.FACES`; None for other photos.
@@ -48,7 +53,7 @@ class Cloud:
     """The points of a scene.
 
     Attributes:
-        positions: (P, 3) float64, world frame.
+        positions: (P, 3) float64.
         colors: (P, 3) uint8 sRGB.
         track_lengths: (P,) int32, number of photos that see a point; 0 if unknown.
         reprojection_errors: (P,) float32, mean over the track, in pixels of the original photos; -1 if unknown.
@@ -58,6 +63,10 @@ class Cloud:
     colors: np.ndarray
     track_lengths: np.ndarray
     reprojection_errors: np.ndarray
+
+    def moved(self, origin: np.ndarray) -> "Cloud":
+        """Return the points in the frame with another origin (3,) in the coordinates of theirs."""
+        return dataclasses.replace(self, positions=self.positions - origin)
 
     @classmethod
     def of(cls, positions: np.ndarray, colors: np.ndarray) -> "Cloud":
@@ -74,6 +83,7 @@ class Capture:
         source: the file or folder that the cameras were read from.
         photos: the photos, sorted by name.
         cloud: the points; None if the scene has none.
+        origin: (3,) float64, world coordinates of the origin of the frame of photos and cloud; see `Scene.origin`.
         test: names of the test photos; None for every eighth photo.
         background: default colour behind transparent photos; None drops their alpha.
     """
@@ -81,8 +91,48 @@ class Capture:
     source: Path
     photos: list[Photo]
     cloud: Cloud | None
+    origin: np.ndarray
     test: frozenset[str] | None = None
     background: tuple[float, float, float] | None = None
+
+    @classmethod
+    def of(cls, source: Path, photos: list[Photo], cloud: Cloud | None, **more: Any) -> "Capture":
+        """Sort photos by name, and move photos and cloud from the world frame to one near them where that is needed."""
+        photos = sorted(photos, key=lambda photo: photo.name)
+        largest = max((max(photo.lens.width, photo.lens.height) for photo in photos), default=0)
+        origin = far_origin([photo.viewmat for photo in photos], largest, cloud)
+        if origin.any():
+            photos = [dataclasses.replace(photo, viewmat=moved(photo.viewmat, origin)) for photo in photos]
+            cloud = cloud and cloud.moved(origin)
+        return cls(source, photos, cloud, origin, **more)
+
+
+def far_origin(viewmats: Sequence[np.ndarray], size: int, cloud: Cloud | None) -> np.ndarray:
+    """Choose the origin (3,) of a frame in whose coordinates single precision loses less than 1/100 pixel.
+
+    Takes world-to-camera matrices (4, 4) float64 and the pixels of the photos' longer side, roughly a focal length.
+    """
+    centres = np.array([-viewmat[:3, :3].T @ viewmat[:3, 3] for viewmat in viewmats]).reshape(-1, 3)
+    if not len(centres) or not np.isfinite(centres).all():
+        return np.zeros(3)
+    middle = np.median(centres, axis=0)
+    depth = float(np.linalg.norm(centres - middle, axis=1).max())
+    if cloud is not None and len(cloud.positions):
+        from scipy.spatial import cKDTree
+
+        sample = cloud.positions[:: -(-len(cloud.positions) // DEPTH_SAMPLES)]
+        depth = float(np.median(cKDTree(centres).query(sample)[0])) or depth
+    lost = 2.0**-24 * np.abs(centres).max() * size
+    if not depth > 0 or lost <= LOST_PIXELS * depth:
+        return np.zeros(3)
+    return np.round(middle, -math.floor(math.log10(depth)))
+
+
+def moved(viewmat: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    """Return a world-to-camera matrix (4, 4) float64 for the frame with another origin (3,) in world coordinates."""
+    out = viewmat.copy()
+    out[:3, 3] += viewmat[:3, :3] @ origin
+    return out
 
 
 @contextmanager

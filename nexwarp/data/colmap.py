@@ -98,11 +98,14 @@ def capture_of(records: Records, folder: Path, images: Path, follow_links: bool)
     each = (_photo(image, records.cameras, lenses, folder, images, follow_links) for image in records.images.values())
     photos = distinct_photos(folder, each)
     if not len(records.points.ids):
-        return Capture(folder, sorted(photos, key=lambda photo: photo.name), None)
+        return Capture.of(folder, photos, None)
     records = dataclasses.replace(records, points=_without_strays(records, folder))
-    cloud = _cloud(records.points, folder)
-    photos = [dataclasses.replace(photo, points=points) for photo, points in zip(photos, _seen(records), strict=True)]
-    return Capture(folder, sorted(photos, key=lambda photo: photo.name), cloud)
+    capture = Capture.of(folder, photos, _cloud(records.points, folder))
+    assert capture.cloud is not None
+    seen = _seen(records, capture.cloud.positions.astype(np.float32))
+    points_of = {photo.name: points for photo, points in zip(photos, seen, strict=True)}
+    photos = [dataclasses.replace(photo, points=points_of[photo.name]) for photo in capture.photos]
+    return dataclasses.replace(capture, photos=photos)
 
 
 def _photo(
@@ -160,8 +163,8 @@ def _without_strays(records: Records, folder: Path) -> PointRecords:
     return dataclasses.replace(points, seen_by=points.seen_by[known], points=kept, lengths=lengths)
 
 
-def _seen(records: Records) -> list[np.ndarray]:
-    """For each image, the (M, 3) float32 positions of the points that were triangulated from it, by ascending id."""
+def _seen(records: Records, positions: np.ndarray) -> list[np.ndarray]:
+    """For each image, those (M, 3) of the positions (P, 3) that were triangulated from it, by ascending id."""
     points = records.points
     identities = np.array(list(records.images), np.int64)
     ascending = np.argsort(identities)
@@ -173,7 +176,6 @@ def _seen(records: Records) -> list[np.ndarray]:
     pairs.sort()
     pairs = pairs[np.concatenate([[True], pairs[1:] != pairs[:-1]])[: len(pairs)]]
     ends = np.searchsorted(pairs, np.arange(1, len(identities)) * len(points.ids))
-    positions = points.positions.astype(np.float32)
     seen: list[np.ndarray] = [positions[part % len(points.ids)] for part in np.split(pairs, ends)]
     order = np.empty_like(ascending)
     order[ascending] = np.arange(len(ascending))

@@ -1,12 +1,15 @@
 """Views and points from tensors in memory, checked."""
 
+import dataclasses
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.data.capture import LARGEST_COORDINATE, Cloud, safe_name
+from nexwarp.cameras.cameras_file import WORLD
+from nexwarp.data.capture import LARGEST_COORDINATE, LOST_PIXELS, Cloud, far_origin, safe_name
 from nexwarp.data.views import View
 
 Array = torch.Tensor | np.ndarray
@@ -64,6 +67,32 @@ def make_cloud(points: Array, colors: Array | None) -> Cloud:
     return Cloud.of(positions.double().numpy(), values.numpy())
 
 
+def near_origin(
+    train: list[View], test: list[View], cloud: Cloud | None
+) -> tuple[list[View], list[View], Cloud | None]:
+    """Make cameras float32, and move them and the points to a frame near them where they are far from its origin."""
+    cameras = [view.camera for view in (*train, *test)]
+    frames = {camera.origin or WORLD for camera in cameras}
+    if len(frames) > 1:
+        raise ValueError(f"cameras: expected one origin, got {' and '.join(map(str, sorted(frames)[:2]))}")
+    (frame,) = frames
+    size = max(max(camera.width, camera.height) for camera in cameras)
+    shift = far_origin([camera.viewmat.double().numpy() for camera in cameras], size, cloud)
+    if shift.any() and any(camera.viewmat.dtype != torch.float64 for camera in cameras):
+        warnings.warn(
+            f"cameras: float32 rounds viewmats at {tuple(shift.tolist())} by more than {LOST_PIXELS} pixels; "
+            "expected float64 there",
+            stacklevel=3,
+        )
+    x, y, z = (shift + frame).tolist()
+
+    def near(view: View) -> View:
+        camera = dataclasses.replace(view.camera, origin=frame).moved((x, y, z))
+        return dataclasses.replace(view, camera=camera.to(torch.float32))
+
+    return [near(view) for view in train], [near(view) for view in test], cloud and cloud.moved(shift)
+
+
 def _names(names: Sequence[str] | None, count: int) -> list[str]:
     if names is None:
         return [f"{index:0{len(str(count - 1))}d}" for index in range(count)]
@@ -91,8 +120,8 @@ def _view(index: int, image: Array, camera: Camera, mask: Array | None, name: st
             f"got {camera.width}x{camera.height}"
         )
     counts = None if mask is None else _mask(f"masks[{index}]", mask, (height, width))
-    own = Camera(camera.viewmat.detach().cpu().float(), camera.K.detach().cpu().float(), width, height, camera.near)
-    return View(own, pixels, counts, name)
+    matrices = (camera.viewmat.detach().cpu(), camera.K.detach().cpu())
+    return View(Camera(*matrices, width, height, camera.near, origin=camera.origin), pixels, counts, name)
 
 
 def _mask(argument: str, mask: Array, shape: tuple[int, int]) -> torch.Tensor | None:

@@ -5,7 +5,8 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -19,7 +20,7 @@ from nexwarp.data.capture import Capture, Cloud, Photo, report_missing, report_u
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.demo import demo_folder
 from nexwarp.data.images import quiet_pillow
-from nexwarp.data.in_memory import Array, make_cloud, split_views
+from nexwarp.data.in_memory import Array, make_cloud, near_origin, split_views
 from nexwarp.data.memory import check_memory
 from nexwarp.data.ply import read_ply
 from nexwarp.data.random_points import random_points
@@ -98,7 +99,10 @@ class SceneSource:
 
 @dataclass(frozen=True)
 class Scene:
-    """What training sees and what it is judged by, in the world frame and units of the scene's files.
+    """What training sees and what it is judged by, in the units of the scene's files.
+
+    Cameras and points are in the world frame of the files, moved by `origin` where single precision would lose more
+    than a hundredth of a pixel in that frame, as with georeferenced coordinates.
 
     Attributes:
         train: views to learn from, sorted by name.
@@ -114,6 +118,8 @@ class Scene:
         background: colour, three numbers in [0, 1], that transparent photos were put on, and that should lie
             behind a rendering to compare with; None where no photo's transparency was looked at, or none is
             transparent and no colour was asked for.
+        origin: (3,) float64, world coordinates of the origin of the frame of cameras and points; zeros, except for
+            scenes that are far from their world's origin. A position in the world is `origin` + the local one.
         random_background: whether training was asked to put each photo on a colour of its own instead, which
             `View.alpha` allows; `background` is white then, for comparisons.
     """
@@ -128,6 +134,7 @@ class Scene:
     path: Path
     background: tuple[float, float, float] | None = None
     random_background: bool = False
+    origin: torch.Tensor = field(default_factory=partial(torch.zeros, 3, dtype=torch.float64))
 
     @property
     def cameras(self) -> dict[str, dict[str, Camera]]:
@@ -149,8 +156,10 @@ class Scene:
 
         Args:
             images: (H, W, 3) sRGB photos, tensors or arrays, uint8, or floating in [0, 1], which are rounded to 8 bits.
-            cameras: of the photos, of the same sizes; their near depths are kept.
-            points: (P, 3) floating, world units, to start from; None takes random points, as for scenes without any.
+            cameras: of the photos, of the same sizes and of one frame (`Camera.origin`); their near depths are kept.
+                Viewmats far from the world's origin should be float64: they are moved to a frame nearby (`origin`).
+            points: (P, 3) floating, world units, in the cameras' frame, to start from; None takes random points, as for
+                scenes without any.
             colors: (P, 3) sRGB of the points, uint8 or floating in [0, 1]; None only where `points` is None.
             masks: for each photo (H, W) bool, True where it counts, or None where all of it does; None for no masks.
             names: of the photos, each once, as relative paths; None numbers them.
@@ -163,10 +172,11 @@ class Scene:
         Raises:
             TypeError, ValueError: naming the argument, its index, what was expected and what came.
         """
-        train, test = split_views(images, cameras, masks, names, test_every)
         if points is None and colors is not None:
             raise ValueError("colors: expected None without points, got colours")
         cloud = None if points is None else make_cloud(points, colors)
+        train, test = split_views(images, cameras, masks, names, test_every)
+        train, test, cloud = near_origin(train, test, cloud)
         viewmats = [view.camera.viewmat.double().numpy() for view in train]
         scale = _scene_scale("cameras", viewmats, cloud)
         return _make_scene(train, test, cloud, scale, Path("memory"), None)
@@ -251,9 +261,9 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | No
         capture = _read_capture(source, path, kind)
         if len(capture.photos) < 2:
             raise ValueError(f"{capture.source}: expected at least 2 registered images (1 to train, 1 to test), got 1")
-        cloud = capture.cloud if source.points is None else read_ply(Path(source.points))
-        if cloud is None and kind == "colmap":
-            raise ValueError(f"{capture.source}: the COLMAP model has no 3D points, expected at least one")
+        cloud = capture.cloud
+        if source.points is not None:
+            cloud = read_ply(Path(source.points)).moved(capture.origin)
         tests = [
             index % TEST_EVERY == 0 if capture.test is None else photo.name in capture.test
             for index, photo in enumerate(capture.photos)
@@ -261,7 +271,7 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | No
         viewmats = [photo.viewmat for photo, test in zip(capture.photos, tests, strict=True) if not test]
         scale = _scene_scale(str(capture.source), viewmats, cloud)
         background = capture.background if color is None else color
-        train, held_out = _read_views(source, path, capture.photos, tests, background, NEAR_FRACTION * scale, progress)
+        train, held_out = _read_views(source, path, capture, tests, background, NEAR_FRACTION * scale, progress)
         if color is None and all(view.alpha is None for view in train + held_out):
             background = None  # behind opaque photos there is none to see
         scene = _make_scene(train, held_out, cloud, scale, path, background)
@@ -299,7 +309,7 @@ def find_format(path: Path, format: str | None = None) -> str:
 def _read_views(
     source: SceneSource,
     path: Path,
-    photos: list[Photo],
+    capture: Capture,
     tests: list[bool],
     background: tuple[float, float, float] | None,
     near: float,
@@ -308,11 +318,12 @@ def _read_views(
     """Read all photos; return the training views and the test views."""
     alpha_mask = source.masks == ALPHA
     reader = ViewReader(source.downscale, background, alpha_mask)
-    plans = _map(reader.plan, _with_masks(path, photos, source.masks), MAX_READERS)
+    plans = _map(reader.plan, _with_masks(path, capture.photos, source.masks), MAX_READERS)
     jobs = [job for plan in plans for job in plan]
     channels = 3 + (background is not None) + (alpha_mask or any(job.photo.mask for job in jobs))
     workers = _workers(source, path, channels, jobs)
-    views = _map(lambda job: reader.read(job, near), jobs, workers, progress)
+    x, y, z = capture.origin.tolist()
+    views = _map(lambda job: reader.read(job, near, (x, y, z)), jobs, workers, progress)
     held_out = [test for plan, test in zip(plans, tests, strict=True) for _ in plan]
     train = [view for view, test in zip(views, held_out, strict=True) if not test]
     return train, [view for view, test in zip(views, held_out, strict=True) if test]
@@ -338,6 +349,7 @@ def _make_scene(
         scale=scale,
         path=path,
         background=background,
+        origin=torch.tensor(train[0].camera.origin, dtype=torch.float64),
     )
 
 

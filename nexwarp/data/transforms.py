@@ -85,7 +85,7 @@ def read_nerfstudio(path: Path, images: str, follow_links: bool = False, skip_mi
     frames = _read_frames(path / NERFSTUDIO_FILE, images, follow_links, skip_missing)
     report_unused(frames.file, path / images, frames.photos)
     photos, test = _split(frames)
-    return Capture(frames.file, photos, _points(frames), test)
+    return Capture.of(frames.file, photos, _points(frames), test=test)
 
 
 def read_blender(path: Path, images: str, follow_links: bool = False, skip_missing: bool = False) -> Capture:
@@ -103,13 +103,14 @@ def read_blender(path: Path, images: str, follow_links: bool = False, skip_missi
         (path / BLENDER_FILES[part] for part in ("test", "val") if (path / BLENDER_FILES[part]).is_file()), None
     )
     if file is None:
-        return Capture(train_file, train.photos, cloud, frozenset(train.held_out) or None, WHITE)
+        test = frozenset(train.held_out) or None
+        return Capture.of(train_file, train.photos, cloud, test=test, background=WHITE)
     held_out = _read_frames(file, images, follow_links, skip_missing).photos
     test = frozenset(photo.name for photo in held_out) | train.held_out
     again = [photo.name for photo in train.photos if photo.name in test - train.held_out]
     if again:
         raise ValueError(f"{file}: {again[0]} is in {train_file.name} too, expected other photos to judge by")
-    return Capture(train_file, sorted(train.photos + held_out, key=lambda photo: photo.name), cloud, test, WHITE)
+    return Capture.of(train_file, train.photos + held_out, cloud, test=test, background=WHITE)
 
 
 def _read_frames(file: Path, images: str, follow_links: bool, skip_missing: bool) -> _Frames:

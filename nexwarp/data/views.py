@@ -118,8 +118,8 @@ class ViewReader:
             return [PlannedView(photo, size, target)]
         return [PlannedView(_face(photo, face), size, target) for face in FACES]
 
-    def read(self, plan: PlannedView, near: float) -> View:
-        """Read, undistort and reduce a photo; `near` is the near depth of its camera, world units.
+    def read(self, plan: PlannedView, near: float, origin: tuple[float, float, float]) -> View:
+        """Read, undistort and reduce a photo; `near` and `origin` are those of its camera.
 
         Raises:
             ValueError: the photo or mask cannot be decoded, the mask is empty, or the camera is invalid.
@@ -134,7 +134,7 @@ class ViewReader:
         K[:2] /= self.downscale
         try:
             viewmat = torch.from_numpy(photo.viewmat).float()
-            camera = Camera(viewmat, torch.from_numpy(K).float(), image.shape[1], image.shape[0], near)
+            camera = Camera(viewmat, torch.from_numpy(K).float(), image.shape[1], image.shape[0], near, origin=origin)
         except ValueError as error:
             raise ValueError(f"{photo.file}: the camera of this image is not usable: {error}") from error
         points = None if photo.points is None else torch.from_numpy(photo.points)

@@ -8,6 +8,7 @@ import torch
 from typing_extensions import Unpack
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.cameras_file import origin_of
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderChanges
@@ -84,6 +85,7 @@ def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
             "width": camera.width,
             "height": camera.height,
             "near": camera.near,
+            **({"origin": list(camera.origin)} if camera.origin else {}),
         },
         "frame": "world to camera; cameras x right, y down, z forward; pixel centres at +0.5",
     }
@@ -104,7 +106,7 @@ def load_buffers(path: str | os.PathLike[str]) -> Buffers:
             raise ValueError(f"format: expected {FORMAT}, got {metadata['format']}")
         stored = metadata["camera"]
         viewmat, K = (torch.tensor(stored[name], dtype=torch.float32) for name in ("viewmat", "K"))
-        camera = Camera(viewmat, K, stored["width"], stored["height"], stored["near"])
+        camera = Camera(viewmat, K, stored["width"], stored["height"], stored["near"], origin=origin_of(stored))
         slots = range(metadata["max_hits"])
         buffers: dict[str, torch.Tensor] = {}
         for name in PASSES:

@@ -10,6 +10,7 @@ from torch import nn
 from typing_extensions import Unpack
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.cameras_file import WORLD, origin_of
 from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.io.json_files import Json
 from nexwarp.model import graphs
@@ -33,7 +34,7 @@ class Model(nn.Module):
         detail_limits: detail limits of the N surfels; None limits nothing.
         options: the options of its rendering.
         meta: further facts, as JSON values: `near` [world units], `scene_scale` [world units], `preset`, `iteration`;
-            a finished model also has `smooth_sh`.
+            `origin` (see the property), where it is not (0, 0, 0); a finished model also has `smooth_sh`.
 
     Raises:
         TypeError, ValueError: the message names the argument.
@@ -78,6 +79,14 @@ class Model(nn.Module):
         """Device of the surfels."""
         return self.surfels.device
 
+    @property
+    def origin(self) -> tuple[float, float, float] | None:
+        """World coordinates of the origin of the surfels' frame, whose axes are the world's; None if it is unknown.
+
+        Not (0, 0, 0) for scenes far from their world's origin only: see `Scene.origin`.
+        """
+        return WORLD if "origin" not in self.meta and "scene_scale" in self.meta else origin_of(self.meta)
+
     @overload
     def render(
         self, camera: Camera | RayCamera, *, background: Color | None = ..., **changes: Unpack[RenderChanges]
@@ -98,8 +107,8 @@ class Model(nn.Module):
         """Render the scene as `nexwarp render` does, with exposures and detail limits. Differentiable.
 
         Args:
-            camera: one camera, or several, which may differ in size. Cameras are moved to the model's device. What a
-                `RayCamera` renders is not differentiable.
+            camera: one camera, or several, which may differ in size. Cameras are moved to the model's device, and to
+                its frame where they have an `origin`. What a `RayCamera` renders is not differentiable.
             background: see `nexwarp.render`; None takes that of the options.
             changes: fields of `RenderOptions` to change for this rendering, such as `exposure="mean"`.
 
@@ -144,6 +153,8 @@ class Model(nn.Module):
         options = self.options.changed(**changes)
         texture = self.texture if options.max_hits else None
         color = options.background if background is None else background
+        if isinstance(camera, Camera) and camera.origin not in (None, self.origin) and self.origin is not None:
+            camera = camera.moved(self.origin).to(self.surfels.means.dtype)
         return graphs.Frame(self.surfels, texture, self.exposures, self.detail_limits, camera, options, color)
 
     def bare(self, **changes: Unpack[RenderChanges]) -> "Model":

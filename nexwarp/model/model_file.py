@@ -9,6 +9,7 @@ from typing import cast
 
 import torch
 
+from nexwarp.cameras.cameras_file import origin_of
 from nexwarp.errors import FormatError, MissingError, check_range, check_tensors, check_version
 from nexwarp.io.files import one_line, write_atomically
 from nexwarp.io.json_files import Json, parse_json
@@ -140,6 +141,7 @@ def _read_options(meta: dict[str, Json]) -> RenderOptions:
     values: dict[str, object] = {name: meta.pop(name) for name in names if name in meta}
     if isinstance(color := values["background"], list):
         values["background"] = tuple(color)
+    origin_of(meta)
     for name in ("near", "scene_scale", "smooth_sh"):
         if name in meta:
             value = meta[name]

@@ -18,8 +18,9 @@ from nexwarp.export.bake.glb import check_package, save_glb
 from nexwarp.export.mesh import Progress, extract_mesh, save_mesh
 from nexwarp.export.splats_spz import save_splats_spz
 from nexwarp.export.surfels_ply import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_surfels_ply
+from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
-from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, TRAIN
+from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, ORIGIN_FILE, TRAIN
 from nexwarp.run.opened import OpenedModel
 
 
@@ -65,6 +66,22 @@ def export_run(
     """
     order.check()
     folder = order.out or opened.folder / EXPORT_FOLDER
+    return [*_export(opened, order, folder, device, observe), *_export_origin(opened, order, folder)]
+
+
+def _export_origin(opened: OpenedModel, order: ExportOrder, folder: Path) -> list[Path]:
+    """Write where the frame of exported positions lies in the world, unless it is the world's or the file says so."""
+    if order.format in ("compact", "cameras") or not any(opened.model.origin or ()):
+        return []
+    file = (folder.parent if folder.suffix == ".html" else folder) / ORIGIN_FILE
+    write_json(file, {"origin": opened.model.origin, "meaning": "world position = origin + exported position"})
+    return [file]
+
+
+def _export(
+    opened: OpenedModel, order: ExportOrder, folder: Path, device: torch.device | str, observe: Progress
+) -> Sequence[Path]:
+    """Write the files of a format."""
     files = [folder / name for name in EXPORTS[order.format]]
     views = _all_cameras(opened) if order.format not in ("compact", "mesh", "cameras") else {}
     if order.format == "web":

@@ -108,5 +108,5 @@ def _halved(camera: Camera, photo: torch.Tensor, counts: torch.Tensor) -> Aim:
     layers = torch.nn.functional.avg_pool2d(layers, 2).permute(1, 2, 0)
     K = camera.K.clone()
     K[:2] /= 2
-    small = Camera(camera.viewmat, K, camera.width // 2, camera.height // 2, camera.near)
+    small = dataclasses.replace(camera, K=K, width=camera.width // 2, height=camera.height // 2)
     return small, layers[..., :3].contiguous(), (layers[..., 3] == 1).to(photo)

@@ -53,6 +53,7 @@ ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIV
 TEACHERS_FOLDER = "teachers"
 TENSORBOARD_FOLDER = "tensorboard"
 EXPORT_FOLDER = "export"
+ORIGIN_FILE = "origin.json"  # beside exports in the frame of a model whose origin is not the world's
 # The files of each --format of `nexwarp export`.
 EXPORTS = {
     "ply": ("surfels.ply", "splats.ply"),
@@ -87,7 +88,7 @@ OURS = re.compile(
             r"camera_path_[1-9]\d*\.json",
             rf"(?:{_any(CHECKPOINTS)}|{_ASIDE})/{_any(CHECKPOINT_FILES)}",
             rf"{TENSORBOARD_FOLDER}/events\.out\.tfevents\.[^/]*",
-            rf"{EXPORT_FOLDER}/{_any(name for names in EXPORTS.values() for name in names)}",
+            rf"{EXPORT_FOLDER}/{_any([ORIGIN_FILE, *(name for names in EXPORTS.values() for name in names)])}",
             rf"{RENDERS_FOLDER}/(?:{_any(PROJECTIONS)}/)?(?:{_any(PATHS)}|path_[^/]+)/\d{{4,}}\.(?:png|exr)",
         ]
     )
@@ -410,10 +411,15 @@ def remove_leftovers(run: Path) -> None:
     remove_empty(sorted(folders, reverse=True))
 
 
-def keep_camera_path(folder: Path, cameras: Sequence[Camera], opened: Path | None = None) -> str:
+def keep_camera_path(
+    folder: Path,
+    cameras: Sequence[Camera],
+    opened: Path | None = None,
+    origin: tuple[float, float, float] | None = None,
+) -> str:
     """Write a camera path into a folder under the next free name; return the command that renders it.
 
-    `opened` is the run or model that the command names; None is the folder.
+    `opened` is the run or model that the command names; None is the folder. `origin` is that of the cameras' frame.
     """
     folder.mkdir(parents=True, exist_ok=True)
     number = 1
@@ -424,5 +430,5 @@ def keep_camera_path(folder: Path, cameras: Sequence[Camera], opened: Path | Non
         except FileExistsError:
             number += 1
             continue
-        save_camera_path(path, cameras)
+        save_camera_path(path, [dataclasses.replace(camera, origin=origin or camera.origin) for camera in cameras])
         return f"nexwarp render {opened or folder} --path {path}"

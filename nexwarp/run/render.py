@@ -13,7 +13,7 @@ import torch
 from tyro.conf import arg
 
 from nexwarp.cameras.camera import Camera, resized
-from nexwarp.cameras.cameras_file import CAMERAS_FILE
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, WORLD
 from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.cameras.paths import PATHS
 from nexwarp.cameras.ray_camera import MAX_SIDE, RayCamera
@@ -169,7 +169,7 @@ class RenderOrder:
             if self.frames is not None:
                 raise SettingError(f"--frames: expected no value with {file}, which sets it, got {self.frames}")
             near = next((c.near for group in opened.cameras.values() for c in group.values()), near_depth(opened.model))
-            path = load_camera_path(file, near)
+            path = load_camera_path(file, near, opened.model.origin or WORLD)
             return renders / FILE_PATH.format(file.stem), path.cameras, path.fps or FPS
         count = FRAMES if self.frames is None else self.frames
         cameras = opened.path_cameras()

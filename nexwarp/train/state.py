@@ -94,7 +94,10 @@ class TrainingState:
     def facts(self) -> dict[str, Json]:
         """Return what a model says of its training; see `Model.meta`."""
         near, scale = self.scene.train[0].camera.near, self.scene.scale
-        return {"near": near, "scene_scale": scale, "preset": self.config.preset, "iteration": self.iteration}
+        facts: dict[str, Json] = {"near": near, "scene_scale": scale, "preset": self.config.preset}
+        if self.scene.origin.any():
+            facts["origin"] = self.scene.origin.tolist()
+        return facts | {"iteration": self.iteration}
 
     def save_cameras(self, folder: str | os.PathLike[str]) -> None:
         """Write the scene's cameras into a folder, so that a model there can be rendered from them."""

@@ -87,7 +87,7 @@ class TaughtTargets(TargetSource):
         """Return the target of a step with a teacher: its rendering, of the photo's size, at the mean exposure."""
         _, near, teacher = self.choice(number)
         c = of_photo.camera
-        camera = Camera(near.viewmat.to(c.K.device), c.K, c.width, c.height, c.near)
+        camera = Camera(near.viewmat.to(c.K.device), c.K, c.width, c.height, c.near, origin=near.origin)
         with self.launches():
             picture = teacher.render_image(camera, background=of_photo.background, exposure="mean")
         # Gains of 1, and depths of 0, which stand for no point: without masks, steps with photos have the same graph.

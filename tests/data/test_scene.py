@@ -243,7 +243,6 @@ BAD_SCENES = {
     ),
     "no images in the model": (built(names=[]), "has no registered images"),
     "one image": (built(names=["a.png"]), "at least 2 registered images .* got 1"),
-    "no points": (built(points=np.zeros((0, 3))), "no 3D points, expected at least one"),
     "points of NaN": (built(points=NOT_A_NUMBER), r"finite 3D points, got \(0.0, nan, 0.0\)"),
     "escaping name": (built(names=["../x.png", "a.png"]), "image name '../x.png' leaves the images folder"),
     "absolute name": (built(names=["C:\\x.png", "a.png"]), "image name .* leaves the images folder"),
