@@ -1,10 +1,12 @@
-"""The documents against the code: options.md and cli.md are made from it, and every command and link is tried.
+"""The documents against the code: options.md, cli.md and api.md are made from it, and every command and link is tried.
 
-python -m tests.docs.test_docs --write      # writes docs/options.md and docs/cli.md
+python -m tests.docs.test_docs --write      # writes docs/options.md, docs/cli.md and docs/api.md
 """
 
 import ast
 import contextlib
+import dataclasses
+import functools
 import importlib.util
 import inspect
 import io
@@ -134,12 +136,141 @@ def commands_page() -> str:
     return "\n".join(page)
 
 
+# docs/api.md
+
+API_PAGE = """\
+# Python API
+
+The public names of `nexwarp`, those of `nexwarp.__all__`; they are [stable](versioning.md). [Training from
+Python](python.md) shows how they go together. `python -m tests.docs.test_docs --write` makes this page of the
+docstrings, which `help(nw.render)` shows, too.
+"""
+# Titles, and the rooms of the package whose names stand below them.
+ROOMS = {
+    "Models and rendering": ("model", "ops", "kernels"),
+    "Cameras": ("cameras",),
+    "Scenes": ("data", "io"),
+    "Training": ("train", "run", "cli"),
+}
+SECTION = re.compile(r"(Args|Attributes|Buffers|Returns|Yields|Raises):")
+
+
+def source_signature(made: Any, name: str) -> str:
+    """The signature as the code has it, types included."""
+    if isinstance(made, type):
+        if dataclasses.is_dataclass(made):
+            types = annotations_of(made)
+            fields = [
+                f"{field.name}: {types[field.name]}{default_of(field)}"
+                for field in dataclasses.fields(made)
+                if field.init
+            ]
+            return f"{name}({', '.join(fields)})"
+        made = vars(made).get("__init__", None)
+        if made is None:
+            return name
+    node = ast.parse(textwrap.dedent(inspect.getsource(made))).body[0]
+    assert isinstance(node, ast.FunctionDef)
+    if node.args.args and node.args.args[0].arg in ("self", "cls"):
+        node.args.args.pop(0)
+    result = "" if node.returns is None or node.name == "__init__" else f" -> {ast.unparse(node.returns)}"
+    return f"{name}({ast.unparse(node.args)}){result}"
+
+
+def annotations_of(made: type) -> dict[str, str]:
+    """Types of a class's fields as the code has them."""
+    types = {}
+    for base in reversed([base for base in made.__mro__ if dataclasses.is_dataclass(base)]):
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        assert isinstance(definition, ast.ClassDef)
+        for line in definition.body:
+            if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
+                types[line.target.id] = ast.unparse(line.annotation)
+    return types
+
+
+def default_of(field: dataclasses.Field[Any]) -> str:
+    if field.default is not dataclasses.MISSING:
+        return f" = {field.default!r}"
+    return "" if field.default_factory is dataclasses.MISSING else " = ..."
+
+
+def markdown_of(doc: str) -> str:
+    """A docstring in Google's style as Markdown: its sections become lists."""
+    page: list[str] = []
+    section = ""
+    for line in doc.splitlines():
+        heading = SECTION.fullmatch(line.strip()) if not line.startswith(" ") else None
+        indent, text = len(line) - len(line.lstrip()), line.strip()
+        if heading:
+            section = heading[1]
+            page += [f"*{section}*", ""]
+        elif section and text and indent == 4:
+            name, colon, rest = text.partition(": ")
+            named = colon and re.fullmatch(r"[\w., *]+", name)
+            page.append(
+                f"- `{name}`: {rest}"
+                if named
+                else f"- {text}"
+                if section in ("Args", "Attributes", "Buffers", "Raises")
+                else text
+            )
+        elif section and text and indent > 4:
+            page.append(f"  {text}")
+        else:
+            section = "" if text and indent == 0 else section
+            page.append(line)
+    return "\n".join(page).strip()
+
+
+def members(made: type) -> Iterator[tuple[str, Any]]:
+    """Public methods and properties of a class with what they are."""
+    for name, value in vars(made).items():
+        value = value.__func__ if isinstance(value, (classmethod, staticmethod)) else value
+        if (
+            not name.startswith("_")
+            and inspect.getdoc(value)
+            and (inspect.isfunction(value) or isinstance(value, property | functools.cached_property))
+        ):
+            yield name, value
+
+
+def api_page() -> str:
+    """The text of docs/api.md."""
+    public = {name: getattr(nw, name) for name in nw.__all__ if name != "__version__"}
+    table, texts = ["| name | what |", "|---|---|"], []
+    for title, rooms in ROOMS.items():
+        texts.append(f"## {title}\n")
+        for name in sorted(public, key=str.lower):
+            made = public[name]
+            module = made.__name__ if inspect.ismodule(made) else made.__module__
+            if module.split(".")[1] not in rooms:
+                continue
+            doc = inspect.getdoc(made) or ""
+            table.append(f"| [`{name}`](#{name.lower()}) | {cell(doc.splitlines()[0])} |")
+            texts.append(f"### {name}\n")
+            if inspect.ismodule(made):
+                texts.append(markdown_of(doc) + "\n")
+                continue
+            texts += [f"```python\n{source_signature(made, f'nexwarp.{name}')}\n```\n", markdown_of(doc) + "\n"]
+            for member, value in members(made) if isinstance(made, type) else ():
+                if inspect.isfunction(value):
+                    texts.append(f"```python\n{source_signature(value, f'{name}.{member}')}\n```\n")
+                    texts.append(markdown_of(inspect.getdoc(value) or "") + "\n")
+                else:
+                    texts.append(f"`{name}.{member}`: {markdown_of(inspect.getdoc(value) or '')}\n")
+    assert len(table) - 2 == len(public), "a public name of a room that no title has"
+    return "\n".join([API_PAGE, *table, "", *texts]).rstrip() + "\n"
+
+
 def test_the_help_of_train_fits_a_screen():
     lines = help_text("train", width=80).splitlines()
     assert sum(len(textwrap.wrap(line, 80) or [""]) for line in lines) <= 50
 
 
-@pytest.mark.parametrize(("name", "made"), [("cli.md", commands_page), ("options.md", options_page)])
+@pytest.mark.parametrize(
+    ("name", "made"), [("cli.md", commands_page), ("options.md", options_page), ("api.md", api_page)]
+)
 def test_pages_are_those_of_the_code(name, made):
     assert (DOCS / name).read_text(encoding="utf-8") == made(), "python -m tests.docs.test_docs --write"
 
@@ -203,11 +334,6 @@ def test_pages_are_in_the_site_s_navigation():
     assert pages - {"index.md"} <= set(re.findall(r"\]\(([a-z_]+\.md)", first))
 
 
-def test_the_api_page_has_every_public_name():
-    page = (DOCS / "api.md").read_text(encoding="utf-8")
-    assert sorted(re.findall(r"^::: nexwarp\.(\w+)$", page, re.M)) == sorted(set(nw.__all__) - {"__version__"})
-
-
 @pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="needs the extra docs")
 def test_the_site_builds(tmp_path):
     """All links and anchors between pages lead somewhere, and all names of the API are found."""
@@ -225,12 +351,13 @@ def test_links():
 
 
 def main(arguments: list[str]) -> int:
-    """Write docs/options.md and docs/cli.md."""
+    """Write the pages that are made of the code."""
     if arguments != ["--write"]:
         print("usage: python -m tests.docs.test_docs --write", file=sys.stderr)
         return 2
     (DOCS / "options.md").write_text(options_page(), encoding="utf-8")
     (DOCS / "cli.md").write_text(commands_page(), encoding="utf-8")
+    (DOCS / "api.md").write_text(api_page(), encoding="utf-8")
     return 0
 
 
