@@ -118,6 +118,8 @@ class Model(nn.Module):
         Raises:
             TypeError, ValueError: a type, shape or device does not fit; the message names the argument.
         """
+        if torch.compiler.is_compiling():  # one break of the graph, instead of one at each kernel
+            return torch.compiler.disable(self.render)(camera, background=background, **changes)
         if isinstance(camera, Sequence) and not isinstance(camera, str):
             return [self.render(item, background=background, **changes) for item in camera]
         if not isinstance(camera, (Camera, RayCamera)):
@@ -142,6 +144,8 @@ class Model(nn.Module):
         Raises:
             TypeError, ValueError: a type, shape or device does not fit; the message names the argument.
         """
+        if torch.compiler.is_compiling():
+            return torch.compiler.disable(self.render_image)(camera, background=background, **changes)
         if not isinstance(camera, Camera):
             raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
         with torch.no_grad():

@@ -75,6 +75,10 @@ def rasterize(  # noqa: PLR0913  # gsplat's order of arguments
         TypeError, ValueError: a type, shape or device does not fit; the message names the argument.
         OutOfMemoryError: memory does not suffice.
     """
+    if torch.compiler.is_compiling():  # one break of the graph, instead of one at each kernel
+        return torch.compiler.disable(rasterize)(
+            means, quats, scales, opacities, gammas, colors, camera, max_hits, background
+        )
     cameras = [camera] if isinstance(camera, Camera) else list(camera)
     if not cameras or not all(isinstance(x, Camera) for x in cameras):
         raise TypeError(f"camera: expected a nexwarp.Camera or a list of them, got {camera!r:.60}")

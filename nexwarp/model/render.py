@@ -182,6 +182,10 @@ def render(
         TypeError, ValueError: a type, shape, value or device does not fit; the message names the argument.
         OutOfMemoryError: memory does not suffice; what surely does not fit is refused before anything is allocated.
     """
+    if torch.compiler.is_compiling():  # one break of the graph, instead of one at each kernel
+        return torch.compiler.disable(render)(
+            surfels, texture, camera, max_hits, background, sh_degree, clamp_texture, order
+        )
     if not isinstance(surfels, Surfels):
         raise TypeError(f"surfels: expected a nexwarp.Surfels, got {type(surfels).__name__}")
     if not isinstance(camera, Camera):

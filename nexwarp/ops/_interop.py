@@ -5,7 +5,7 @@ import functools
 import os
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import torch
@@ -27,6 +27,42 @@ class Context(torch.autograd.function.FunctionCtx):
 
     saved_tensors: tuple[torch.Tensor, ...]
     needs_input_grad: tuple[bool, ...]
+
+
+Backward = Callable[..., tuple[torch.Tensor | None, ...]]
+
+
+class _Gradients(torch.autograd.Function):
+    """The first `count` tensors, gradients that depend on all others in a way that nothing here differentiates."""
+
+    @staticmethod
+    def forward(ctx: Context, count: int, *tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        return tuple(x.view_as(x) for x in tensors[:count])
+
+    @staticmethod
+    def backward(ctx: Context, *signals: torch.Tensor) -> None:
+        raise RuntimeError("second derivatives are not supported: nexwarp's kernels have first ones only")
+
+
+def first_derivative(backward: Backward) -> Backward:
+    """Decorate a backward pass so that differentiating its gradients raises.
+
+    Torch's `once_differentiable` takes them for constants where the incoming ones are, or where `torch.autograd.grad`
+    asks for the gradients of some tensors alone.
+    """
+
+    @functools.wraps(backward)
+    def marked(ctx: Context, *signals: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+        with torch.no_grad():
+            grads = backward(ctx, *signals)
+        if not torch.is_grad_enabled():
+            return grads
+        given = [x.detach().requires_grad_() for x in grads if x is not None]
+        sources = (x for x in (*ctx.saved_tensors, *signals) if x is not None and x.requires_grad)
+        marked_grads = iter(_Gradients.apply(len(given), *given, *sources) if given else ())
+        return tuple(None if x is None else next(marked_grads) for x in grads)
+
+    return marked
 
 
 def real_of(tensor: torch.Tensor) -> type:

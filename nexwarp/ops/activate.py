@@ -1,12 +1,11 @@
 """Activation of the surfels' raw parameters."""
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.activate import activate_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, launch, real_of, struct
+from nexwarp.ops._interop import Argument, Context, array, first_derivative, launch, real_of, struct
 
 
 def activate(
@@ -65,7 +64,7 @@ class _Activate(torch.autograd.Function):
         return activated
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: Context, grad_quats: torch.Tensor, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         raw = ctx.saved_tensors
         grad_raw = [torch.empty_like(x) for x in raw]

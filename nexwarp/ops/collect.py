@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.collect import collect_kernel
@@ -18,6 +17,7 @@ from nexwarp.ops._interop import (
     Argument,
     Context,
     array,
+    first_derivative,
     from_fixed_point,
     launch,
     real_of,
@@ -262,7 +262,7 @@ class _Collect(torch.autograd.Function):
         return outputs
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: _Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         scene, request = ctx.rest
         plain, base, _ids, depths, weights, alphas, _stops, more = grads

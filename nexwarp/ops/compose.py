@@ -3,11 +3,10 @@
 import math
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.compose import compose_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, first_derivative, launch, real_of
 
 
 def compose(
@@ -64,7 +63,7 @@ class _Compose(torch.autograd.Function):
         return image, textured
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(
         ctx: Context, grad_image: torch.Tensor | None, grad_textured: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:

@@ -2,11 +2,10 @@
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.detail import antialias_kernels, limit_depths_kernel
-from nexwarp.ops._interop import Context, array, launch, real_of
+from nexwarp.ops._interop import Context, array, first_derivative, launch, real_of
 from nexwarp.ops.activate import parameters
 
 
@@ -63,7 +62,7 @@ class _Antialias(torch.autograd.Function):
         return blurred
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         farthest, focal, depths, *shape = ctx.saved_tensors
         real = real_of(farthest)
@@ -107,7 +106,7 @@ class _LimitDepths(torch.autograd.Function):
         return limited
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         depths, limited = ctx.saved_tensors
         return None, grad.where(depths == limited, 0.0), None, None, None

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
 from nexwarp.kernels.fused_texture import (
@@ -32,7 +31,7 @@ from nexwarp.native.fused_texture import (
     logical_feature,
     logical_output,
 )
-from nexwarp.ops._interop import Argument, Context, array, graph_is_kept, launch, struct
+from nexwarp.ops._interop import Argument, Context, array, first_derivative, graph_is_kept, launch, struct
 from nexwarp.ops.neural_field import HALF_GRADIENT, Field, Points, Rays
 
 GROUP_BYTES = 2**24  # of sums that a launch of the backward lookup adds to: a third of an H100's L2 cache
@@ -107,7 +106,7 @@ class _Colors(torch.autograd.Function):
         return result
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: _Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         positions, depths, directions, focal, table, resolutions, encoded, packed, result, *weights = ctx.saved_tensors
         need_positions, need_depths, need_grid = ctx.needs_input_grad[4:7]

@@ -4,12 +4,11 @@ import math
 from collections.abc import Sequence
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.photometric import expose_kernels, photometric_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, first_derivative, launch, real_of
 
 Factors = tuple[float, float, float]
 
@@ -92,7 +91,7 @@ class _Photometric(torch.autograd.Function):
         return tuple(next(sums) if factor else None for factor in factors)
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: _Context, *grads: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         tensors = ctx.saved_tensors
         like = next(x for x in tensors if x is not None)
@@ -157,7 +156,7 @@ class _Expose(torch.autograd.Function):
         return exposed, exposed_colors
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(
         ctx: _Context, grad_exposed: torch.Tensor | None, grad_exposed_colors: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:

@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.project import project_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, first_derivative, launch, real_of
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ class _Project(torch.autograd.Function):
         return records, centers, limits
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(
         ctx: Context, grad_records: torch.Tensor | None, _centers: None, _limits: None
     ) -> tuple[torch.Tensor | None, ...]:

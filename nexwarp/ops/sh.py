@@ -1,12 +1,11 @@
 """Plain colours of surfels from spherical harmonics."""
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.sh import plain_colors_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Context, array, launch, real_of
+from nexwarp.ops._interop import Context, array, first_derivative, launch, real_of
 
 
 def plain_colors(
@@ -62,7 +61,7 @@ class _PlainColors(torch.autograd.Function):
         return colors
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: _Context, grad_colors: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         shN, means, position, colors = ctx.saved_tensors
         need_sh0, need_shN, need_means, need_position, _ = ctx.needs_input_grad

@@ -2,11 +2,10 @@
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.ssim import C1, C2, REACH, THREADS, WINDOW_SIZE, blocks_of, gradient_kernel, score_kernel, tap
-from nexwarp.ops._interop import Context, array, launch, real_of
+from nexwarp.ops._interop import Context, array, first_derivative, launch, real_of
 
 
 def weighted_dssim(image: torch.Tensor, target: torch.Tensor, factor: float = 1.0) -> torch.Tensor:
@@ -75,7 +74,7 @@ class _KernelDSSIM(torch.autograd.Function):
         return losses.sum()
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: _Context, grad_loss: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         image, target, derivatives = ctx.saved_tensors
         height, width = image.shape[0], 3 * image.shape[1]

@@ -4,12 +4,11 @@ from dataclasses import dataclass
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.surface import surface_kernel
 from nexwarp.kernels.surface_backward import surface_backward_kernel
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, struct
+from nexwarp.ops._interop import Argument, Context, array, first_derivative, struct
 from nexwarp.ops.collect import Hits, SlotSums, Walked
 from nexwarp.ops.project import Pinhole, Projection
 from nexwarp.ops.tiles import Tiles
@@ -93,7 +92,7 @@ class _Surface(torch.autograd.Function):
         return expected, median, top, normals
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: _Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         stops, expected, normals, totals, picks = ctx.saved_tensors
         scene = ctx.scene

@@ -8,13 +8,21 @@ from typing import Any
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.sh import textured_colors_kernels
 from nexwarp.kernels.types import types
 from nexwarp.ops import fused_texture, mlp
-from nexwarp.ops._interop import STORAGES, Argument, Context, array, launch, real_of, sums_in_fixed_point
+from nexwarp.ops._interop import (
+    STORAGES,
+    Argument,
+    Context,
+    array,
+    first_derivative,
+    launch,
+    real_of,
+    sums_in_fixed_point,
+)
 from nexwarp.ops.neural_field import Field, Points, Rays, gradient_scale
 
 # Runs of levels that CPU threads share out in the backward pass.
@@ -97,7 +105,7 @@ class _Texture(torch.autograd.Function):
         return colors
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: _Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         positions, depths, focal, directions, resolutions, table, coefficients, *rest = ctx.saved_tensors
         layers, matrices = rest[: ctx.layers], rest[ctx.layers :]

@@ -1,11 +1,10 @@
 """World positions of hits and directions of rays."""
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from nexwarp.kernels.types import types
 from nexwarp.kernels.unproject import unproject_kernels
-from nexwarp.ops._interop import Argument, Context, array, launch, real_of
+from nexwarp.ops._interop import Argument, Context, array, first_derivative, launch, real_of
 from nexwarp.ops.project import Pinhole
 
 
@@ -46,7 +45,7 @@ class _Unproject(torch.autograd.Function):
         return positions, directions
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(
         ctx: _Context, grad_positions: torch.Tensor | None, grad_directions: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:

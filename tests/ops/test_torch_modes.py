@@ -1,10 +1,12 @@
-"""Rendering inside of torch's modes: inference mode and autocast change neither a bit nor a later training."""
+"""Rendering inside of torch's modes and transforms: the table of docs/python.md."""
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 import torch
+import torch.utils.checkpoint
 
 import nexwarp as nw
 from nexwarp.kernels import launch
@@ -15,8 +17,10 @@ from nexwarp.train.trainer import Trainer
 from tests.narrowing import present
 from tests.render_support import BACKGROUND, BUFFERS, assert_same, loss
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.tolerances import assert_close
 from tests.trainer_support import assert_same_state, small
 
+SECOND = r"^second derivatives are not supported"
 HALVES = [torch.bfloat16, torch.float16]
 
 
@@ -134,3 +138,64 @@ def test_parameters_in_half_precision_are_refused(dtype, device):
         copy.deepcopy(model).to(dtype).render(camera)
     with pytest.raises(TypeError, match=f"^texture.grid: expected dtype torch.float32, got {dtype}"):
         nw.render(model.surfels, copy.deepcopy(present(model.texture)).to(dtype), camera)
+
+
+# Transforms: the table of docs/python.md, row by row
+
+
+def drawings(device: torch.device) -> tuple[dict[str, Callable[[torch.Tensor], torch.Tensor]], torch.Tensor]:
+    """Sums of renderings in the three ways of asking for one, as functions of a plain tensor; and such a tensor."""
+    model, camera = model_of(device)
+    scene: dict[str, Any] = random_scene(60, device=device, width=61, height=45)
+    shape = {name: scene[name] for name in ("quats", "scales", "opacities", "gammas")}
+
+    def rasterized(means: torch.Tensor) -> torch.Tensor:
+        hits = nw.rasterize(means, **shape, colors=means.cos(), camera=camera)
+        return nw.compose(hits, hits.points.sin(), 0.5).square().mean()
+
+    return {
+        "render": lambda x: (nw.render(model.surfels, model.texture, camera).image * x.cos().mean()).square().mean(),
+        "model": lambda x: (model.render(camera).image * x.cos().mean()).square().mean(),
+        "rasterize": rasterized,
+    }, scene["means"].requires_grad_()
+
+
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")  # torch's own, of its guards
+@pytest.mark.parametrize("name", ["render", "model", "rasterize"])
+def test_compiled_code_calls_a_rendering_as_it_is(name, device):
+    draws, means = drawings(device)
+    expected = draws[name](means)
+    value = torch.compile(draws[name], backend="aot_eager")(means)  # warnings are errors
+    assert_close(value, expected, kind="value", name=name)
+    grads = [torch.autograd.grad(x, means)[0] for x in (value, expected)]
+    assert_close(*grads, kind="gradient", name=name)
+    with pytest.raises(Exception, match="intentionally marked"):
+        torch.compile(draws[name], backend="eager", fullgraph=True)(means)
+
+
+def test_second_derivatives_raise(device):
+    """Of every parameter, whether all gradients or one alone are asked for; never a constant without a word."""
+    model, camera = model_of(device, finished=False)
+    for x in (*model.surfels.parameters(), present(model.texture).grid, camera.viewmat):
+        out = model.render(camera)
+        total = out.image.sum() if x is present(model.texture).grid else out.image.sum() + out.expected_depth.sum()
+        (grad,) = torch.autograd.grad(total, x, create_graph=True)
+        with pytest.raises(RuntimeError, match=SECOND):
+            torch.autograd.grad(grad.sum(), x, retain_graph=True)
+        with pytest.raises(RuntimeError, match=SECOND):
+            (grad.sum() + x.sum()).backward()
+
+
+def test_checkpoint_draws_again(device):
+    draws, means = drawings(device)
+    for draw in draws.values():
+        again = torch.utils.checkpoint.checkpoint(draw, means, use_reentrant=False)
+        assert torch.equal(*(torch.autograd.grad(x, means)[0] for x in (again, draw(means))))
+
+
+@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.vmap, torch.func.jacrev])
+def test_function_transforms_are_refused_by_torch(transform, device):
+    draws, means = drawings(device)
+    tensors = means.detach()[None] if transform is torch.func.vmap else means.detach()
+    with pytest.raises(RuntimeError, match="must override the setup_context"):
+        transform(draws["rasterize"])(tensors)
