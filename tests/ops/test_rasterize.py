@@ -1,6 +1,8 @@
 """`nw.rasterize` and `nw.compose`: the K-buffer of plain tensors under a shading of one's own."""
 
 import dataclasses
+import textwrap
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -222,3 +224,18 @@ def test_a_graph_that_would_be_cut_is_refused(device):
             draw()
         with torch.no_grad():
             draw()
+
+
+def test_the_shading_of_the_docs_reaches_all_that_it_was_made_of():
+    """The code of docs/python.md as it stands, on a scene of this file."""
+    page = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
+    section = page.split("\n## Your own shading\n")[1].split("\n## ")[0]
+    code = textwrap.dedent("\n".join(line for line in section.splitlines() if line.startswith("    ")))
+    scene = named_scene("random", torch.float32, "cpu")
+    camera, count = make_camera(scene), len(scene["means"])
+    values: dict[str, Any] = {name: scene[name].requires_grad_() for name in GEOMETRY[1:]}
+    values |= {"torch": torch, "nw": nw, "camera": camera, "count": count, "photo": torch.rand(18, 23, 3)}
+    exec(code, values)
+    leaves = [*(values[name] for name in ("features", *GEOMETRY[1:])), camera.viewmat]
+    for x in (*leaves, *values["net"].parameters(), *values["head"].parameters()):
+        assert x.grad is not None and x.grad.abs().sum() > 0
