@@ -5,8 +5,8 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from nexwarp.errors import StorageError
@@ -18,12 +18,14 @@ STALE_SECONDS = 600.0
 UNSYNCABLE = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
 
 
+def printable(text: str) -> str:
+    """Text with its control, bidirectional and other characters that do not print escaped, line breaks too."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
+
+
 def one_line(text: object, limit: int = 300) -> str:
     """Text from a file as one printable line of at most `limit` characters, for a message."""
-    line = "".join(
-        c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode()
-        for c in " ".join(str(text)[: 4 * limit].split())
-    )
+    line = printable(" ".join(str(text)[: 4 * limit].split()))
     return line if len(line) <= limit else f"{line[: limit - 3]}..."
 
 
@@ -112,6 +114,30 @@ def write_atomically(path: Path, content: bytes) -> None:
     """Write a file to a temporary name and rename it: it is complete or absent, even after a power failure."""
     with written_aside(path) as temporary:
         temporary.write_bytes(content)
+
+
+def write_together(contents: Mapping[Path, bytes]) -> None:
+    """Write files, the first one last, by their paths; where one cannot be written, none is there that was not before.
+
+    The disk has stored all contents before the first of them replaces an older file.
+    """
+    absent = [path for path in contents if not path.exists()]
+    created: list[Path] = []
+    try:
+        for path in contents:
+            created += make_folders(path.parent)
+        with ExitStack() as stack:
+            for path, content in contents.items():
+                temporary = stack.enter_context(written_aside(path, durable=False))
+                temporary.write_bytes(content)
+                sync(temporary)
+        for folder in {path.parent for path in contents}:
+            sync(folder)
+    except BaseException:
+        for path in absent:
+            path.unlink(missing_ok=True)
+        remove_empty(sorted(created, reverse=True))
+        raise
 
 
 def sync(path: Path) -> None:

@@ -1,6 +1,7 @@
 """Files are written under names that nobody can foresee, and are new: no link is ever written through."""
 
 import os
+import shutil
 import threading
 import time
 from pathlib import Path
@@ -15,11 +16,13 @@ from nexwarp.io.files import (
     is_temporary,
     temporary_name,
     write_atomically,
+    write_together,
     written_aside,
 )
 from nexwarp.run.folder import keep_camera_path
 from nexwarp.run.log import _open_log
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
+from tests.faults import Disk, failing
 from tests.scenes import make_camera, random_scene
 
 
@@ -102,3 +105,23 @@ def test_camera_paths_of_viewers_at_the_same_time_all_stay(tmp_path):
     for thread in threads:
         thread.join()
     assert len(list(tmp_path.iterdir())) == 40 and all(file.stat().st_size for file in tmp_path.iterdir())
+
+
+def test_files_written_together_are_all_there_or_none(tmp_path):
+    """A new folder is gone after any fault; older files stay as long as the disk has not stored all new ones."""
+    new, old = tmp_path / "new", tmp_path / "old"
+    for folder in (new, old):
+        contents = {folder / "index.html": b"page", folder / "shaders" / "a.wgsl": b"a", folder / "b.js": b"b"}
+        for _ in range(1 if folder == new else 2):  # folders are made once
+            with failing(Disk(folder)) as counted:
+                write_together(contents)
+        requests = counted.requests
+        replaced = next(i for i, request in enumerate(requests) if request.startswith("replace"))
+        assert [r for r in requests if r.startswith("replace")][-1] == "replace index.html", "the page comes last"
+        for fatal in range(len(requests) if folder == new else replaced):
+            if folder == new:
+                shutil.rmtree(new, ignore_errors=True)
+            with failing(Disk(folder, fatal)), pytest.raises(OSError):
+                write_together({path: b"newer" for path in contents})
+            left = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+            assert left == ({} if folder == new else contents) and folder.exists() == (folder == old), requests[fatal]

@@ -15,7 +15,7 @@ from nexwarp.cameras.camera import Camera, resized
 from nexwarp.errors import FormatError
 from nexwarp.export.web.atlas import bake
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
-from nexwarp.io.files import write_atomically
+from nexwarp.io.files import write_together
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.model import Model
 
@@ -38,9 +38,9 @@ def export_web(
     if out.suffix == ".html":
         content = {out.name: one_file(content)}
         out = out.parent
-    for name, data in content.items():
-        write_atomically(out / name, data)
-    return [out / name for name in content]
+    files = {out / name: data for name, data in sorted(content.items(), key=lambda item: item[0] != INDEX)}
+    write_together(files)  # the page itself last
+    return list(files)
 
 
 def page_files(
