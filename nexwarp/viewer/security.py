@@ -131,7 +131,7 @@ class Gate:
 
     def __init__(self, access: Access) -> None:
         self.access = access
-        self.connections: set[Connection] = set()  # TCP
+        self.connections: dict[Connection, None] = {}  # TCP, the oldest first
         self.clients: set[Connection] = set()  # those of them that are WebSockets
         self.attached = False  # viser's server runs behind this gate
         self.is_open = False  # requests are answered
@@ -165,6 +165,7 @@ class Gate:
         reason = self.access.refusal(request.path, request.headers)
         if reason is not None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
+        connection.is_admitted = True
         if len(self.clients) >= MAX_CLIENTS:
             text = f"the viewer serves at most {MAX_CLIENTS} browser tabs: close one of them and reload this page\n"
             return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, text)
@@ -185,19 +186,23 @@ class Connection(ServerConnection):
     def __init__(self, gate: Gate, *arguments: object, **options: object) -> None:
         super().__init__(*arguments, **options)  # type: ignore[arg-type]
         self.gate = gate
+        self.is_admitted = False  # a request of it has passed the rules of access
         self.sending = 0  # messages that the client has not taken yet
         self.next_due = self.in_time = 0.0
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take up a TCP connection, or drop it if there are too many."""
+        """Take up a TCP connection. If there are too many, drop the oldest that has not sent a valid request."""
         super().connection_made(transport)
-        self.gate.connections.add(self)
-        if len(self.gate.connections) > MAX_CONNECTIONS:
-            self.transport.abort()
+        connections = self.gate.connections
+        connections[self] = None
+        if len(connections) > MAX_CONNECTIONS:
+            dropped = next((other for other in connections if not other.is_admitted), self)
+            del connections[dropped]  # it is lost later
+            dropped.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget a closed connection."""
-        self.gate.connections.discard(self)
+        self.gate.connections.pop(self, None)
         self.gate.clients.discard(self)
         super().connection_lost(exc)
 

@@ -280,7 +280,7 @@ class Viewer:
                 image.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
                 self.thumbnails[name] = np.asarray(image)
             except (OSError, ValueError, RuntimeError, MemoryError) as error:
-                log.warning("%s has no thumbnail: %s", name, error)
+                log.warning("%s has no thumbnail: %s", one_line(name), _reason(error))
         self.photos = {}
 
     def _goodbye(self, client: "viser.ClientHandle") -> None:

@@ -145,20 +145,20 @@ def test_200_clients_are_served_or_refused_with_a_reason(model):
             assert late.picture().ndim == 3
 
 
-def test_connections_that_say_nothing_are_bounded(model):
-    with serving(model) as viewer:
+def test_connections_that_say_nothing_are_bounded_and_lock_nobody_out(model):
+    with serving(model) as viewer, Client(viewer) as early:
         url = urlsplit(viewer.url)
         silent = [socket.create_connection((str(url.hostname), int(url.port or 0))) for _ in range(200)]
         gate = viewer.web.gate
         wait_for(lambda: len(gate.connections) == security.MAX_CONNECTIONS)
         time.sleep(0.1)
         assert len(gate.connections) == security.MAX_CONNECTIONS, "the others are closed"
+        with Client(viewer) as late:
+            for client in (early, late):
+                client.look()
+                assert client.picture().ndim == 3
         for connection in silent:
             connection.close()
-        wait_for(lambda: not gate.connections)
-        with Client(viewer) as client:
-            client.look()
-            assert client.picture().ndim == 3
 
 
 def test_large_messages_close_their_connection(model):
