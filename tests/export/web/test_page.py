@@ -268,6 +268,16 @@ def rebuilt(content: bytes, **changes: Any) -> bytes:
     return content[:12] + struct.pack("<I", len(text)) + text + content[16 + size :]
 
 
+def inflated(content: bytes) -> bytes:
+    """A baked scene whose sections promise 2^24 surfels of deflated zeros, 3 GB."""
+    size = struct.unpack("<I", content[12:16])[0]
+    header = json.loads(content[16 : 16 + size])
+    for section in header["sections"]:
+        section["shape"] = [2**24 if n == header["surfels"] else n for n in section["shape"]]
+        section["encoding"] = "deflate"
+    return rebuilt(content, surfels=2**24, sections=header["sections"])
+
+
 def test_damaged_files_give_one_line(tab, site):
     """What scenes have in common with baked ones is tried in test_webgpu.py."""
     good = site.files[atlas.BAKED_FILE]
@@ -279,6 +289,7 @@ def test_damaged_files_give_one_line(tab, site):
         ({atlas.BAKED_FILE: rebuilt(good, atlas=picture)}, "atlas: expected a picture's file"),
         ({atlas.BAKED_FILE: rebuilt(good, sh_ranges=[1])}, "sh_ranges: expected three numbers"),
         ({atlas.ATLAS_FILE: b"no picture"}, "expected a picture"),
+        ({atlas.BAKED_FILE: inflated(good)}, "expected sections that unpack to at most 134"),
         ({atlas.BAKED_FILE: None}, "WebGPU"),  # there is no baked scene: what is missing is WebGPU
     ]
     for files, words in damaged:

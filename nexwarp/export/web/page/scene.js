@@ -12,6 +12,9 @@ const VERSION = 1;
 const LARGEST_HEADER = 4 * 2 ** 20;
 const LARGEST_SURFELS = 2 ** 24;
 const LARGEST_SECTION = 2 ** 30;
+// Bytes that a file may unpack to: so many, and so many times its size.
+const UNPACKED = 2 ** 27;
+const LARGEST_RATIO = 128;
 const LARGEST_VALUE = 1e16;
 const LARGEST_SIDE = 16384; // of the atlas of a baked scene
 const NEVER = 1e30;
@@ -236,6 +239,10 @@ class ByteReader {
     }
 }
 
+function unpackedSize(entry) {
+    return entry.shape.reduce((product, one) => product * one, SIZES[entry.dtype]);
+}
+
 async function inflate(bytes, size, name) {
     const reader = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate")).getReader();
     const content = new Uint8Array(size);
@@ -294,6 +301,10 @@ export class SceneReader {
         const expected = JSON.stringify(this.kind.sections(header));
         const listed = JSON.stringify(this.entries.map((entry) => [entry.name, entry.dtype, entry.shape]));
         expect(listed === expected, "expected the sections that the header describes");
+        const unpacked = this.entries.reduce((sum, entry) => sum + unpackedSize(entry), 0);
+        const stored = this.entries.reduce((sum, entry) => sum + (isInteger(entry.bytes, 0, 2 ** 40) ? entry.bytes : 0), 0);
+        const most = UNPACKED + LARGEST_RATIO * stored;
+        expect(unpacked <= most, `expected sections that unpack to at most ${most} bytes, got ${unpacked}`);
         this.header = header;
         return header;
     }
@@ -315,7 +326,7 @@ export class SceneReader {
     async readTo(name) {
         while (this.entries.length > 0 && !(name in this.arrays)) {
             const entry = this.entries.shift();
-            const size = entry.shape.reduce((product, one) => product * one, SIZES[entry.dtype]);
+            const size = unpackedSize(entry);
             expect(size <= LARGEST_SECTION, `section ${entry.name}: expected at most ${LARGEST_SECTION} bytes, got ${size}`);
             let bytes = await this.content(entry, size);
             expect(["raw", "deflate"].includes(entry.encoding), `section ${entry.name}: expected the encoding raw or deflate`);
