@@ -1,6 +1,7 @@
 """`nexwarp eval`."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -85,7 +86,10 @@ def figures(results: Mapping[str, Json], metrics: Sequence[str] = ("psnr", "ssim
     rows = {}
     for name in metrics:
         value = results[name]
-        text = f"{value:.2f} dB" if name == "psnr" else f"{value:.4f}" if value is not None else "not available"
+        if name == "psnr":
+            text = f"{math.inf if value is None else value:.2f} dB"
+        else:
+            text = "not available" if value is None else f"{value:.4f}"
         rows[f"test {name.upper()}"] = text
     return rows
 
@@ -108,5 +112,12 @@ def evaluate_run(
             model, views, renders=renders, mask_mode=mask_mode, metrics=metrics, progress=done, ranks=ranks
         )
     entries = facts | cast(dict[str, Json], results)
-    write_json(run / METRICS_FILE, entries)
+    write_json(run / METRICS_FILE, _finite(entries))
     return entries
+
+
+def _finite(value: Json) -> Json:
+    """Return JSON with null for infinity, which JSON does not have: the PSNR of equal pictures."""
+    if isinstance(value, dict):
+        return {name: _finite(inner) for name, inner in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value

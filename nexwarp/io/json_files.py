@@ -28,8 +28,8 @@ OTHERS = bytes(set(range(256)) - set(b"[{]}"))
 
 
 def write_json(path: Path, data: object) -> None:
-    """Write indented JSON atomically."""
-    write_atomically(path, (json.dumps(data, indent=2) + "\n").encode())
+    """Write indented JSON atomically; ValueError for NaN and infinity, which JSON does not have."""
+    write_atomically(path, (json.dumps(data, indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: Path, *, max_bytes: int = MAX_BYTES, finite: bool = False) -> Any:

@@ -173,7 +173,7 @@ def read_metrics(run: Path) -> dict[str, Json]:
             raise ValueError(f"expected an object, got {type(metrics).__name__}")
         check_version(metrics.get("format_version", 1), RUN_VERSION)
         for name in ("psnr", "ssim"):
-            if not isinstance(metrics.get(name, 0.0), (int, float)):
+            if metrics.get(name) is not None and not isinstance(metrics[name], (int, float)):
                 raise ValueError(f"{name}: expected a number, got {metrics[name]!r}")
         return metrics
     except READ_ERRORS as error:

@@ -1,6 +1,7 @@
 """Models that Python saved open in view, render, export, info and eval, with or without a run around them."""
 
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import torch
 import nexwarp as nw
 from nexwarp.cameras.paths import surrounding
 from nexwarp.cli import main as cli
-from nexwarp.run.evaluate import evaluate
+from nexwarp.io.json_files import read_json
+from nexwarp.run.evaluate import METRICS, evaluate
 from nexwarp.run.opened import near_depth, open_model
 from nexwarp.train.trainer import Trainer
 from tests.scene_writers import write_demo
@@ -58,6 +60,19 @@ def test_a_saved_model_opens_everywhere(
     metrics = json.loads((results / "metrics.json").read_text())
     views = nw.load_scene(demo).test
     assert metrics["psnr"] == pytest.approx(evaluate(nw.load(saved), views)["psnr"])
+
+
+def test_views_that_equal_their_photos_have_no_infinity_in_their_metrics(
+    model: nw.Model, demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """JSON has none: null stands for it, and is shown as what it is."""
+    model.save(tmp_path / "model")
+    monkeypatch.setitem(METRICS, "psnr", lambda *_: math.inf)
+    assert cli.main(["eval", str(tmp_path / "model"), "--scene", str(demo), "--device", "cpu"]) == 0
+    metrics = read_json(tmp_path / "model" / "metrics.json", finite=True)
+    assert metrics["psnr"] is None and {view["psnr"] for view in metrics["views"].values()} == {None}
+    assert cli.main(["info", str(tmp_path / "model")]) == 0
+    assert capsys.readouterr().out.count("inf dB") == 2
 
 
 def test_a_trainer_saves_what_the_commands_open_and_what_it_restores(demo: Path, tmp_path: Path) -> None:
