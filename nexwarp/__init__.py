@@ -1,6 +1,23 @@
 """nexwarp: Nexels, neurally-textured surfels for real-time novel view synthesis, in NVIDIA Warp and PyTorch."""
 
 import os
+import signal
+import sys
+from typing import NoReturn
+
+
+def _interrupted(*_: object) -> NoReturn:
+    """End the command, of which nothing has begun; of several ranks, one says so."""
+    if os.environ.get("RANK", "0") == "0":
+        os.write(2, b"nexwarp: interrupted\n")
+    os._exit(130)
+
+
+# While the command `nexwarp` loads its libraries, for seconds, Ctrl-C would print a traceback.
+_program = os.path.basename(sys.argv[0]) if sys.argv else ""
+_is_command = _program in ("nexwarp", "nexwarp.exe") or (_program == "-m" and "nexwarp" in sys.orig_argv)
+if _is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, _interrupted)
 
 # Before torch is imported: its idle OpenMP threads would otherwise spin on the cores that the CPU kernels need.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

@@ -19,6 +19,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from nexwarp.io.files import printable
 from nexwarp.model.model import Model
 from nexwarp.run.log import peak_memory
 from nexwarp.train.report import StepReport
@@ -151,7 +152,7 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
 
 def results_table(rows: dict[str, str], title: str) -> Table:
     """Return a table of two columns: names and values."""
-    table = Table(title=title, show_header=False)
+    table = Table(title=printable(title), show_header=False)
     for name, value in rows.items():
-        table.add_row(name, value)
+        table.add_row(printable(name), printable(value))
     return table

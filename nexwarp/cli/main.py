@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable
 from contextlib import redirect_stderr
 from difflib import get_close_matches
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import tyro
 from rich.console import Console
@@ -22,6 +22,7 @@ from nexwarp.cli.signals import deferred_stop, stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.cli.view import ViewCommand
 from nexwarp.errors import NexwarpError, RankError
+from nexwarp.io.files import printable
 from nexwarp.machine import needed_memory
 from nexwarp.train.ranks.launch import end_process, launch, may_speak
 
@@ -41,13 +42,18 @@ COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
 
 
 class OutputConsole(Console):
-    """A console that raises BrokenPipeError when nobody reads its output any more; rich's own exits with 1.
+    """The console of all output: names from photos and files cannot control the terminal, nor look like other text.
 
-    It takes brackets as they are, since paths may have them.
+    It takes brackets as they are, since paths may have them. It raises BrokenPipeError when nobody reads its output any
+    more; rich's own exits with 1.
     """
 
     def __init__(self) -> None:
         super().__init__(markup=False)
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print text with what does not print escaped, or a table."""
+        super().print(*(printable(x) if isinstance(x, str) else x for x in objects), **options)
 
     def on_broken_pipe(self) -> NoReturn:
         """Raise the error that is being handled."""
@@ -114,32 +120,49 @@ def main(arguments: list[str] | None = None) -> int:
 
     # Hide Warp's warnings, which users cannot act on.
     wp.config.log_level = wp.LOG_ERROR
+    _open_streams()
+    words = sys.argv[1:] if arguments is None else arguments
     try:
-        return _run(sys.argv[1:] if arguments is None else arguments)
+        with stopped_by_signals():
+            return _run([word for word in words if word != "--debug"], debug="--debug" in words)
     except BrokenPipeError:
-        # Otherwise Python would try to write the rest when it ends, and report that it cannot.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return CLOSED_PIPE
+    finally:
+        try:
+            sys.stdout.flush()
+        except OSError:
+            # Otherwise Python would try to write the rest when it ends, and report that it cannot.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _run(words: list[str]) -> int:
+def _open_streams() -> None:
+    """Let what this process was started without, stdin, stdout or stderr, lead nowhere, instead of into a file."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_RDWR), number)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r+"))
+
+
+def _run(words: list[str], *, debug: bool) -> int:
     """Run a command and return its exit code; BrokenPipeError if nobody reads its output any more."""
-    debug = "--debug" in words
-    arguments = [word for word in words if word != "--debug"]
-    if arguments == ["--version"]:
-        print(f"nexwarp {__version__}", flush=True)
-        return 0
+    command: Callable[[Console], None] | None = None
     try:
-        command = _parse(arguments)
-    except SystemExit:
-        sys.stdout.flush()  # the text of --help
-        raise
-    console = OutputConsole()
-    try:
+        if words == ["--version"]:
+            print(f"nexwarp {__version__}", flush=True)
+            return 0
+        command = _parse(words)
+        if isinstance(command, Train):
+            command.given = frozenset(
+                word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")
+            )
         if isinstance(command, Train) and (count := command.starts()):
             with deferred_stop() as stop:
-                return launch(count, [*PROGRAM, *words], stop)
-        with stopped_by_signals(), display.plain_warnings(console):
+                return launch(count, [*PROGRAM, *words, *(["--debug"] if debug else [])], stop)
+        console = OutputConsole()
+        with display.plain_warnings(console):
             command(console)
         sys.stdout.flush()
     except BrokenPipeError:
@@ -154,7 +177,7 @@ def _run(words: list[str]) -> int:
     return 0
 
 
-def _tell(error: Exception, command: Callable[[Console], None], debug: bool) -> int:
+def _tell(error: Exception, command: Callable[[Console], None] | None, debug: bool) -> int:
     """Print one line about an error; return the exit code."""
     hint = "; --resume continues from the last checkpoint" if isinstance(command, Train) else ""
     text, code = f"error: {error}", 2
@@ -176,8 +199,9 @@ def _complain(text: str, error: BaseException | None = None, *, debug: bool = Fa
     if not may_speak(error):
         return
     if debug and error is not None:
-        traceback.print_exception(error)
-    line = " ".join(f"nexwarp: {text}".split())
+        for line in "".join(traceback.format_exception(error)).splitlines():
+            print(printable(line), file=sys.stderr)
+    line = printable(" ".join(f"nexwarp: {text}".split()))
     Console(stderr=True, soft_wrap=True, highlight=False).print(line, markup=False)
 
 

@@ -17,7 +17,7 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Raise `Stopped` in the block on SIGTERM or SIGHUP; Ctrl-C raises KeyboardInterrupt as usual.
+    """Raise `Stopped` in the block on Ctrl-C, SIGTERM and SIGHUP.
 
     An ignored SIGHUP, as after `nohup`, stays ignored. Other threads than the main one get no signals: there the block
     runs without handlers.
@@ -44,18 +44,18 @@ def deferred_stop() -> Iterator[Callable[[], int | None]]:
         if len(received) > 1:
             raise Stopped(number)
 
-    with _handled(handle, signal.SIGINT):
+    with _handled(handle):
         yield lambda: received[0] if received else None
 
 
 @contextmanager
-def _handled(handle: Callable[[int, FrameType | None], None], *more: int) -> Iterator[None]:
-    """Handle SIGTERM and SIGHUP, where the system has them and does not ignore them, and more signals."""
+def _handled(handle: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Handle SIGINT, SIGTERM and SIGHUP, where the system has them and does not ignore them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    known = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    numbers = [*more, *(number for number in known if signal.getsignal(number) != signal.SIG_IGN)]
+    known = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    numbers = [number for number in known if signal.getsignal(number) != signal.SIG_IGN]
     before = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield

@@ -92,6 +92,8 @@ class Train:
     """Port of --view; 0 picks one."""
     tensorboard: Flag_ = False
     """Also log to RUN/tensorboard (extra tensorboard)."""
+    given: Annotated[frozenset[str], tyro.conf.Suppress] = frozenset()
+    """The options that were typed: one that equals its default must fit a run to resume, too."""
 
     def __call__(self, console: Console) -> None:
         """Train."""
@@ -214,9 +216,9 @@ class Train:
         scene = self.scene.absolute()
         for field in dataclasses.fields(SceneSource):
             value = getattr(scene, field.name)
-            if field.name != "path" and value != field.default:
+            if field.name != "path" and (value != field.default or _flag(field.name) in self.given):
                 _check_same(_flag(field.name), getattr(old.source, field.name), value)
-        if self.preset != "default":
+        if self.preset != "default" or "--preset" in self.given:
             _check_same("--preset", old.config.preset, self.preset)
         config = old.config
         changed = _with_set(with_settings(config, flags), settings)

@@ -1,5 +1,6 @@
 """Which folders may become a run, and what of a run is never overwritten unasked."""
 
+import json
 import shutil
 from contextlib import nullcontext
 
@@ -31,6 +32,18 @@ def test_existing_run_is_refused_and_untouched(finished, scene, capsys):
     ):
         refused(capsys, [*command, "--resume", flag, value], flag, "as in the run to resume", f"got {value}")
     assert snapshot(finished) == before
+
+
+def test_an_option_of_a_resumed_run_counts_if_it_is_its_default(finished, scene, capsys):
+    """Typed, it must be that of the run; not typed, the run's holds."""
+    config = read(finished, "config.json")
+    config["scene"]["downscale"], config["config"]["preset"] = 2, "web"
+    (finished / "config.json").write_text(json.dumps(config))
+    command = ["train", str(scene), "--run", str(finished), "--device", "cpu", "--resume"]
+    refused(capsys, [*command, "--downscale", "1"], "--downscale: expected 2 as in the run to resume, got 1")
+    refused(capsys, [*command, "--preset=default"], "--preset: expected web as in the run to resume, got default")
+    refused(capsys, [*command, "--downscale", "2"], "checkpoint")  # that of photos of another size
+    refused(capsys, command, "checkpoint")
 
 
 def test_overwrite_replaces_a_run(finished, scene):
