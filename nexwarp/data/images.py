@@ -3,14 +3,15 @@
 import io
 import os
 import warnings
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
+from nexwarp.errors import FormatError
 from nexwarp.io.files import one_line
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ MAX_PIXELS = 178_956_970  # PIL's own error limit, twice its limit for a warning
 HONEST_PIXELS, HONEST_RATIO = 40_000_000, (2_000, 16_000)
 MAX_READS = 1_000_000  # a second; a GIF file of 100 MB has as many
 WHITE = 128  # threshold of a mask; if no value reaches it, as in a mask of 0 and 1, all values above 0 are used
+WIDTH, HEIGHT, BITS, PHOTOMETRIC, ORIENTATION, SAMPLE_FORMAT = 256, 257, 258, 262, 274, 339  # TIFF tags
+WHITE_IS_ZERO, UNSIGNED = 0, 1
 
 
 @contextmanager
@@ -71,13 +74,19 @@ def _opened(path: Path) -> Iterator["PIL.Image.Image"]:
                 raise Image.DecompressionBombError
             if pixels > HONEST_PIXELS + HONEST_RATIO[image.mode == "1"] * path.stat().st_size:
                 raise ValueError(f"{image.width}x{image.height} pixels are more than a file of this size holds")
+            _check_numbers(path, image)
             yield image
+    except FormatError:
+        raise
     except Image.DecompressionBombError:
         raise ValueError(
             f"{path}: expected an image of at most {MAX_PIXELS // 10**6} megapixels, got more; reduce it first"
         ) from None
     except UnidentifiedImageError:
-        raise ValueError(f"{path}: expected a complete image file, could not decode it: no format is known") from None
+        raise ValueError(
+            f"{path}: expected a complete image file, could not decode it: no format is known; "
+            "photos have 8 or 16 bits a channel"
+        ) from None
     except Exception as error:  # PIL's decoders raise many types for damaged files
         raise ValueError(f"{path}: expected a complete image file, could not decode it: {one_line(error)}") from error
 
@@ -90,27 +99,70 @@ def _registered() -> Container[str]:
     return Image.OPEN
 
 
+def _check_numbers(path: Path, image: "PIL.Image.Image") -> None:
+    """Raise FormatError where the range of an image's numbers is unknown: floats, signed and 32-bit integers."""
+    tags = getattr(image, "tag_v2", {})
+    formats = tags.get(SAMPLE_FORMAT, (UNSIGNED,))
+    if image.mode == "F" or (image.mode == "I" and tags) or any(kind != UNSIGNED for kind in formats):
+        numbers = "floats" if image.mode == "F" else "signed or 32-bit integers"
+        raise FormatError(f"{path}: expected 8 or 16 bits a channel, got {numbers}, whose range is unknown; convert it")
+
+
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image in pixels, from its header; errors are those of `read_image`."""
+    """Width and height of an image in pixels as stored, from its header; errors are those of `read_image`."""
     with quiet_pillow(), _opened(path) as image:
-        return image.size
+        tags = getattr(image, "tag_v2", None)
+        return image.size if tags is None else (int(tags[WIDTH]), int(tags[HEIGHT]))
+
+
+@contextmanager
+def _loaded(path: Path) -> Iterator["PIL.Image.Image"]:
+    """Open an image and decode its pixels as stored: PIL turns TIFF files by their orientation, which is undone."""
+    from PIL.Image import Transpose
+
+    with _opened(path) as image:
+        orientation = image.getexif().get(ORIENTATION) if hasattr(image, "tag_v2") else None
+        image.load()
+        undo = {
+            2: Transpose.FLIP_LEFT_RIGHT,
+            3: Transpose.ROTATE_180,
+            4: Transpose.FLIP_TOP_BOTTOM,
+            5: Transpose.TRANSPOSE,
+            6: Transpose.ROTATE_90,
+            7: Transpose.TRANSVERSE,
+            8: Transpose.ROTATE_270,
+        }.get(orientation)
+        stored = image if undo is None else image.transpose(undo)
+        yield _full_range(stored, getattr(image, "tag_v2", {}))
+
+
+def _full_range(image: "PIL.Image.Image", tags: Mapping[int, Any]) -> "PIL.Image.Image":
+    """Return 16-bit grey with black as 0 and white as 65535; PIL leaves 12 bits and inverted values of TIFF files."""
+    bits = int(tags.get(BITS, (16,))[0])
+    inverted = tags.get(PHOTOMETRIC) == WHITE_IS_ZERO
+    if not image.mode.startswith("I;16") or (bits == 16 and not inverted):
+        return image
+    from PIL import Image
+
+    values = np.asarray(image).astype(np.int64) * 65535 // (2**bits - 1)
+    return Image.fromarray((65535 - values if inverted else values).astype(np.uint16))
 
 
 def read_image(path: Path) -> torch.Tensor:
     """Read a photo as COLMAP does: EXIF orientation is ignored, grey is repeated, alpha is dropped.
 
     Args:
-        path: a JPEG, PNG, WebP, TIFF, BMP, PPM, GIF, TGA, JPEG 2000 or AVIF file, 8 or 16 bits a channel.
+        path: a JPEG, PNG, WebP, TIFF, BMP, PPM, GIF, TGA, JPEG 2000 or AVIF file, up to 16 bits a channel, unsigned.
 
     Returns:
         (H, W, 3) uint8 sRGB.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file cannot be decoded, is truncated, or has more than 178 megapixels.
+        ValueError: the file cannot be decoded, is truncated, holds numbers of unknown range (floats, signed or 32-bit
+            integers), or has more than 178 megapixels.
     """
-    with _opened(path) as image:
-        image.load()
+    with _loaded(path) as image:
         return torch.from_numpy(_to_rgb(image))
 
 
@@ -123,43 +175,66 @@ def read_transparent(path: Path) -> tuple[torch.Tensor, torch.Tensor | None]:
     Raises:
         FileNotFoundError, ValueError: as of `read_image`.
     """
-    with _opened(path) as image:
-        image.load()
-        if image.has_transparency_data:
-            rgba = np.array(image.convert("RGBA"))
-            return torch.from_numpy(rgba[:, :, :3].copy()), torch.from_numpy(rgba[:, :, 3].copy())
-        return torch.from_numpy(_to_rgb(image)), None
+    with _loaded(path) as image:
+        if not image.has_transparency_data:
+            return torch.from_numpy(_to_rgb(image)), None
+        if image.mode.startswith("I"):  # PNG files with one transparent value of 16 bits
+            alpha = np.where(np.asarray(image) == image.info["transparency"], 0, 255).astype(np.uint8)
+            return torch.from_numpy(_to_rgb(image)), torch.from_numpy(alpha)
+        rgba = np.array(_to_rgba(image))
+        return torch.from_numpy(rgba[:, :, :3].copy()), torch.from_numpy(rgba[:, :, 3].copy())
 
 
 def read_mask(path: Path) -> torch.Tensor:
     """Read a mask, whose white pixels are used.
 
+    The value of a pixel is its brightness, on black where it is transparent. In a palette file it is the index, as in
+    label maps, unless the palette's colours in use are grey, or black and one other colour.
+
     Returns:
-        (H, W) bool, True for values of at least 128; if the file has no such value, True for values above 0.
+        (H, W) bool, True for values of at least 128, of 16 bits 32768; if the file has no such value, True for values
+        above 0.
 
     Raises:
         FileNotFoundError, ValueError: as of `read_image`.
     """
-    with _opened(path) as image:
-        image.load()
-        if image.mode == "P":  # label images: the index is the value, not the palette's colour
-            values = np.array(image)
-        elif image.mode == "1":
-            values = np.array(image).astype(np.uint8)
-        else:
-            values = _to_rgb(image).max(axis=2) if image.mode.startswith("I") else np.array(_grey(image))
-    white = values >= WHITE
-    return torch.from_numpy(white if white.any() else values > 0)
+    with _loaded(path) as image:
+        values, white = _mask_values(image), WHITE
+        if image.mode.startswith("I"):
+            white = 256 * WHITE
+    used = values >= white
+    return torch.from_numpy(used if used.any() else values > 0)
 
 
-def _grey(image: "PIL.Image.Image") -> "PIL.Image.Image":
-    """Convert a mask to grey; a transparent mask is composited on black, so that transparent pixels are not used."""
-    if image.has_transparency_data:
-        from PIL import Image
+def _mask_values(image: "PIL.Image.Image") -> np.ndarray:
+    """Return the values (H, W) that decide which pixels of a mask are used."""
+    if image.mode == "1":
+        return np.array(image).astype(np.uint8)
+    if image.mode.startswith("I"):
+        return np.array(image)
+    if image.mode != "P":
+        return np.array(_on_black(image).convert("L"))
+    indices = np.array(image)
+    every = image.resize((256, 1))
+    every.putdata(range(256))
+    colors = np.array(_on_black(every).convert("RGB"))[0]
+    used = np.unique(colors[np.bincount(indices.ravel(), minlength=256) > 0], axis=0)
+    black_and_another = len(used) == 2 and not used[0].any()
+    return colors.max(axis=1)[indices] if black_and_another or (used == used[:, :1]).all() else indices
 
-        rgba = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), rgba)
-    return image.convert("L")
+
+def _on_black(image: "PIL.Image.Image") -> "PIL.Image.Image":
+    """Composite a transparent image on black."""
+    from PIL import Image
+
+    if not image.has_transparency_data:
+        return image
+    return Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), _to_rgba(image))
+
+
+def _to_rgba(image: "PIL.Image.Image") -> "PIL.Image.Image":
+    """Convert to RGBA; PIL has no direct way from premultiplied grey."""
+    return image.convert("LA" if image.mode == "La" else image.mode).convert("RGBA")
 
 
 def _to_rgb(image: "PIL.Image.Image") -> np.ndarray:
@@ -170,8 +245,8 @@ def _to_rgb(image: "PIL.Image.Image") -> np.ndarray:
         for top in range(0, len(wide), ROWS):
             grey[top : top + ROWS] = np.clip((wide[top : top + ROWS].astype(np.int64) + 128) // 257, 0, 255)
         return np.repeat(grey[:, :, None], 3, axis=2)
-    if image.mode == "P":  # PIL drops the transparency of a palette only through RGBA
-        image = image.convert("RGBA")
+    if image.mode in ("P", "PA", "La"):  # PIL drops their transparency only through RGBA
+        image = _to_rgba(image)
     return np.array(image.convert("RGB"))
 
 

@@ -28,16 +28,78 @@ def test_masks_of_names_with_folders_and_of_another_folder(tmp_path):
     assert masks["left/a.jpg"] is None and np.array_equal(masks["right/a.jpg"].numpy(), MASK)
 
 
-def test_masks_of_labels_and_of_all_kinds(tmp_path):
+def palette(colors, used=None, **options):
+    """Writer of a palette file of colours; `used` are the indices of pixels that do not count, and that do."""
+
+    def write(file, mask):
+        unused, counted = (0, 1) if used is None else used
+        image = Image.fromarray(np.where(mask, counted, unused).astype(np.uint8))
+        image.putpalette(np.array(colors, np.uint8).tobytes())
+        image.save(file, **options)
+
+    return write
+
+
+def values(dtype, unused, counted, mode=None):
+    return lambda file, mask: Image.fromarray(np.where(mask, counted, unused).astype(dtype), mode).save(file)
+
+
+def rgba(color, around, mode="RGBA"):
+    """Writer of a transparent file: a colour with alpha where the mask counts, another elsewhere."""
+    return lambda file, mask: Image.fromarray(np.where(mask[..., None], color, around).astype(np.uint8), mode).save(
+        file
+    )
+
+
+BLACK, WHITE = (0, 0, 0), (255, 255, 255)
+VOC = [BLACK, (128, 0, 0), (0, 128, 0), (128, 128, 0)]
+RAMP = [(i, i, i) for i in range(256)]
+KINDS = {
+    "0 and 1": values(np.uint8, 0, 1),
+    "1 bit": lambda file, mask: Image.fromarray(mask).save(file),
+    "RGB": lambda file, mask: write_mask(file, mask, "RGB"),
+    "16 bits": values(np.uint16, 0, 65535),
+    "16 bits around the threshold": values(np.uint16, 32767, 32768),
+    "16 bits of 0 and 1": values(np.uint16, 0, 1),
+    "white before black": palette([WHITE, BLACK], (1, 0)),
+    "black before white": palette([BLACK, WHITE]),
+    "white before black, 1 bit": palette([WHITE, BLACK], (1, 0), bits=1),
+    "quantised": lambda file, mask: Image.fromarray(mask * np.uint8(255)).convert("RGB").quantize(2).save(file),
+    "quantised grey": palette([(250, 250, 250), (3, 3, 3), (90, 90, 90)], (2, 0)),
+    "red before black": palette([(255, 0, 0), BLACK], (1, 0)),
+    "transparent index": palette([WHITE, WHITE], transparency=0),
+    "labels of VOC": palette(VOC, (0, 3)),
+    "label of VOC that is dark": palette(VOC, (0, 1)),
+    "labels of a grey ramp": palette(RAMP, (0, 5)),
+    "labels of other colours": palette([(31, 119, 180), (255, 127, 14), (44, 160, 44)]),
+    "RGBA": rgba((*WHITE, 255), (*WHITE, 0)),
+    "RGBA, opaque": rgba((*WHITE, 255), (*BLACK, 255)),
+    "LA": rgba((255, 255), (255, 0), "LA"),
+}
+
+
+def written(file, write, mask) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write(file, mask)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_masks_of_every_kind(tmp_path, kind):
+    path = make_scene(tmp_path / "scene", names=["0.png", "1.png"])
+    written(path / "masks" / "0.png", KINDS[kind], MASK)
+    written(path / "masks" / "1.tif.png", KINDS["0 and 1"], MASK)  # of no photo
+    mask = views_of(load_scene(path))[0].mask
+    assert mask is not None and np.array_equal(mask.numpy(), MASK)
+
+
+def test_tiff_masks_are_not_turned_and_floats_are_refused(tmp_path):
     path = make_scene(tmp_path / "scene")
     (path / "masks").mkdir()
-    Image.fromarray(MASK.astype(np.uint8)).save(path / "masks" / "01.png")  # 0 and 1
-    write_mask(path / "masks" / "02.png", MASK, "1")
-    write_mask(path / "masks" / "03.png", MASK, "RGB")
-    write_mask(path / "masks" / "04.png", np.ones((36, 48)))
-    Image.fromarray(np.where(MASK, 65535, 0).astype(np.uint16)).save(path / "masks" / "05.png")
-    masks = [view.mask for view in views_of(load_scene(path))]
-    assert all(np.array_equal(masks[index].numpy(), MASK) for index in (1, 2, 3, 5)) and masks[4] is None
+    Image.fromarray(MASK * np.uint8(255)).save(path / "masks" / "03.png", "TIFF", tiffinfo={274: 3})
+    assert np.array_equal(views_of(load_scene(path))[3].mask.numpy(), MASK)
+    Image.fromarray(MASK.astype(np.float32)).save(path / "masks" / "03.png", "TIFF")
+    with pytest.raises(ValueError, match=r"masks/03.png: expected 8 or 16 bits a channel, got floats"):
+        load_scene(path)
 
 
 def test_masks_go_with_smaller_photos(tmp_path):
