@@ -47,6 +47,7 @@ def save_transforms(
     *,
     train: Sequence[str] | None = None,
     test: Sequence[str] | None = None,
+    lenses: Mapping[str, Mapping[str, Json]] | None = None,
 ) -> None:
     """Write cameras as a `transforms.json`; each frame has its own intrinsics, so that sizes may differ.
 
@@ -55,17 +56,22 @@ def save_transforms(
         cameras: name of the image file -> camera.
         train: names for `train_filenames`.
         test: names for `val_filenames` and `test_filenames`. If `train` and `test` are None, no split is written.
+        lenses: for some names, keys of a distorted lens with its `camera_model`, in place of the camera's intrinsics.
 
     Raises:
         ValueError: no cameras; OSError: `path` cannot be written.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one, got none")
-    frames = []
+    frames: list[dict[str, object]] = []
     for name, camera in cameras.items():
         pose, size = _camera_to_world(camera).tolist(), {"w": camera.width, "h": camera.height}
-        frames.append({"file_path": name, "transform_matrix": pose, **_intrinsics(camera), **size})
-    data: dict[str, object] = {"camera_model": "PINHOLE", "frames": frames}
+        lens = (lenses or {}).get(name, {"camera_model": "PINHOLE", **_intrinsics(camera), **size})
+        frames.append({"file_path": name, "transform_matrix": pose, **lens})
+    models = [frame.pop("camera_model") for frame in frames]  # nerfstudio reads one for the file
+    for frame, model in zip(frames, models, strict=True):
+        frame |= {} if model == models[0] else {"camera_model": model}
+    data: dict[str, object] = {"camera_model": models[0], "frames": frames}
     if train is not None or test is not None:
         held_out = list(test or [])
         data |= {"train_filenames": list(train or []), "val_filenames": held_out, "test_filenames": held_out}

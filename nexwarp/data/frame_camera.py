@@ -15,6 +15,7 @@ ROTATION_TOLERANCE = 1e-3  # that of Camera
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of COLMAP's FULL_OPENCV
 FISHEYE = ("k1", "k2", "k3", "k4")
+FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
 DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")  # in the order of nerfstudio's list
 # Keys of lenses and shutters; what is not read of them would change the picture.
 OPTICAL = re.compile(
@@ -57,6 +58,24 @@ def frame_lens(where: str, frame: JsonObject, shared: JsonObject, file: Path) ->
     except ValueError as error:
         text = str(error)
         raise ValueError(text if text.startswith(where) else f"{where}: {text}") from None
+
+
+def lens_keys(lens: Lens, width: int, height: int) -> JsonObject | None:
+    """Return the keys from which `frame_lens` reads a lens, at a photo's size in pixels; None if there are none."""
+    one_focal = lens.model.startswith(("SIMPLE", "RADIAL"))
+    fx, fy, cx, cy, *coefficients = (lens.params[0], *lens.params) if one_focal else lens.params
+    models: dict[str, tuple[str, tuple[str, ...]]] = {
+        **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE"), ("PINHOLE", ())),
+        **dict.fromkeys(("SIMPLE_RADIAL", "RADIAL", "OPENCV", "BROWN"), ("OPENCV", RADIAL_TANGENTIAL)),
+        "FULL_OPENCV": ("FULL_OPENCV", RADIAL_TANGENTIAL),
+        **dict.fromkeys(FISHEYES, ("OPENCV_FISHEYE", FISHEYE)),
+    }
+    if lens.model not in models:
+        return None
+    model, names = models[lens.model]
+    across, along = width / lens.width, height / lens.height
+    keys: JsonObject = {"camera_model": model, "fl_x": fx * across, "fl_y": fy * along, "cx": cx * across}
+    return {**keys, "cy": cy * along, "w": width, "h": height, **dict(zip(names, coefficients, strict=False))}
 
 
 def _with_list(where: str, frame: JsonObject, shared: JsonObject) -> JsonObject:

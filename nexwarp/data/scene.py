@@ -94,7 +94,15 @@ class SceneSource:
 
     def load(self, progress: ProgressCallback | None = None) -> "Scene":
         """Read the scene; progress and errors are those of `load_scene`."""
-        return _read_scene(self, demo_folder() if self.path == DEMO else Path(self.path), progress)
+        return _read_scene(self, self._folder(), progress)
+
+    def photos(self) -> list[Photo]:
+        """Read the photos' names, files and lenses, without pixels; errors are those of `load_scene`."""
+        with quiet_pillow(), scene_errors():
+            return _read_capture(self, self._folder(), find_format(self._folder(), self.format)).photos
+
+    def _folder(self) -> Path:
+        return demo_folder() if self.path == DEMO else Path(self.path)
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Export of run folders to the formats of other programs."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,17 +12,23 @@ from tyro.conf import arg
 from nexwarp.cameras.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
-from nexwarp.data.scene import SceneSource
+from nexwarp.data.demo import demo_folder
+from nexwarp.data.frame_camera import lens_keys
+from nexwarp.data.images import image_size
+from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import RunError, SettingError
 from nexwarp.export.bake.fit import bake
 from nexwarp.export.bake.glb import check_package, save_glb
 from nexwarp.export.mesh import Progress, extract_mesh, save_mesh
 from nexwarp.export.splats_spz import save_splats_spz
 from nexwarp.export.surfels_ply import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_surfels_ply
-from nexwarp.io.json_files import write_json
+from nexwarp.io.files import one_line
+from nexwarp.io.json_files import JsonObject, write_json
 from nexwarp.model.model_file import save_model
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, ORIGIN_FILE, TRAIN
 from nexwarp.run.opened import OpenedModel
+
+UNDISTORTED = "undistorted"  # folder of names of views that no file shows
 
 
 @dataclass(frozen=True)
@@ -122,19 +129,47 @@ def _export_splats(opened: OpenedModel, files: list[Path], cameras: list[Camera]
 
 
 def _export_cameras(opened: OpenedModel, transforms: Path, camera_path: Path) -> None:
-    """Write the cameras of a run for nerfstudio."""
-    images = SceneSource.images if opened.source is None else opened.source.images
-    # File paths are relative to the scene's folder, where nerfstudio expects the transforms.json.
-    named = {
-        group: {f"{images}/{name}": camera for name, camera in members.items()}
-        for group, members in opened.cameras.items()
-    }
+    """Write the cameras of a run for nerfstudio, with the lenses and sizes of the photos as they lie in their files."""
+    names, lenses = _originals(opened)
+    named = {group: {names[name]: camera for name, camera in cs.items()} for group, cs in opened.cameras.items()}
     cameras = dict(sorted({name: c for members in named.values() for name, c in members.items()}.items()))
     if not cameras:
         raise RunError(f"{opened.folder / CAMERAS_FILE}: expected at least one camera, found none")
-    save_transforms(transforms, cameras, train=sorted(named.get("train", {})), test=sorted(named.get("test", {})))
+    split = {group: sorted(named.get(group, {})) for group in ("train", "test")}
+    save_transforms(transforms, cameras, **split, lenses=lenses)
     first = next(iter(cameras.values()))
     save_camera_path(camera_path, [resized(camera, first.width, first.height) for camera in cameras.values()])
+
+
+def _originals(opened: OpenedModel) -> tuple[dict[str, str], dict[str, JsonObject]]:
+    """Return the files of a run's views, relative to the scene's folder, and the keys of their lenses by file.
+
+    Views that are no photo's, of a panorama or of a lens that nerfstudio does not know, have no keys, and names in a
+    folder of their own. If the scene is not there, all views have their names, and there is a warning.
+    """
+    views = [name for members in opened.cameras.values() for name in members]
+    images = SceneSource.images if opened.source is None else opened.source.images
+    if opened.source is None or not views:
+        return {name: f"{images}/{name}" for name in views}, {}
+    folder = demo_folder() if opened.source.path == DEMO else Path(opened.source.path)
+    try:
+        photos = {photo.name: photo for photo in opened.source.photos()}
+    except (OSError, ValueError) as error:
+        warnings.warn(
+            f"{opened.source.path}: the scene cannot be read ({one_line(error)}), so the intrinsics are those of the "
+            "photos as they were trained on, undistorted and reduced",
+            stacklevel=2,
+        )
+        return {name: f"{images}/{name}" for name in views}, {}
+    names, lenses = {}, {}
+    for name in views:
+        photo = photos.get(name)
+        keys = None if photo is None else lens_keys(photo.lens, *image_size(photo.file))
+        names[name] = f"{UNDISTORTED}/{name}"
+        if photo is not None and keys is not None:
+            names[name] = photo.file.relative_to(folder).as_posix()
+            lenses[names[name]] = keys
+    return names, lenses
 
 
 def _all_cameras(opened: OpenedModel) -> dict[str, Camera]:

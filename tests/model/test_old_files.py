@@ -74,6 +74,7 @@ def test_old_models_render_the_picture_stored_with_them(run: Path) -> None:
     assert_close(rendered(run), expected, kind="value", name=run.name)
 
 
+@pytest.mark.filterwarnings("default:.*the scene cannot be read")
 @EVERY_RUN
 def test_old_runs_serve_every_command(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert read_run(run).config.max_surfels == 24

@@ -28,6 +28,7 @@ from nexwarp.run.opened import open_model
 from nexwarp.run.render import RenderOrder
 from nexwarp.train.recipe import Config
 from tests.cameras.test_paths import ring
+from tests.data.inputs import room
 from tests.scenes import make_surfels, make_texture, random_scene
 
 TRAIN, TEST = ["b.png", "c.jpg", "d.png", "e.png"], ["a.png", "sub/f.png"]
@@ -140,6 +141,7 @@ def test_a_shorter_path_leaves_no_frames_of_a_longer_one(run: Path) -> None:
     assert files(run / "renders" / "ellipse") == {"0000.png", "0001.png"}
 
 
+@pytest.mark.filterwarnings("default:.*the scene cannot be read")
 def test_a_path_from_a_file(run: Path, tmp_path: Path) -> None:
     """nerfstudio's, with its size; and the frames of a transforms.json, all in the size of the first."""
     path = [resized(each, 40, 30) for each in interpolate(ring(3), 2)]
@@ -226,8 +228,10 @@ def test_export_splits_what_is_large_from_the_cameras_of_the_run(run: Path, caps
     assert capsys.readouterr().err == "nexwarp: error: --max-extent: expected more than 0, got 0\n"
 
 
-def test_export_cameras(run: Path) -> None:
+@pytest.mark.filterwarnings("default:.*the scene cannot be read")
+def test_export_cameras(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command("export", run, "--format", "cameras") == 0
+    assert "are those of the photos as they were trained on" in " ".join(capsys.readouterr().out.split())
     assert files(run / "export") == {"transforms.json", "camera_path.json"}
     sets = load_cameras(run / "cameras.json")
     before = {f"images_2/{name}": c for group in sets.values() for name, c in group.items()}
@@ -243,6 +247,41 @@ def test_export_cameras(run: Path) -> None:
     data = json.loads((run / "export" / "transforms.json").read_text())
     assert data["train_filenames"] == [f"images_2/{n}" for n in TRAIN]
     assert data["test_filenames"] == [f"images_2/{n}" for n in TEST]
+
+
+LENS = f"{room.WIDTH} {room.HEIGHT} {' '.join(map(str, room.PINHOLE))}"
+
+
+@pytest.mark.parametrize(
+    ("camera", "model"),
+    [
+        (f"PINHOLE {LENS}", "PINHOLE"),
+        (f"OPENCV {LENS} -0.1 0.02 0.001 0.002", "OPENCV"),
+        (f"SIMPLE_RADIAL_FISHEYE {room.WIDTH} {room.HEIGHT} 40 31 24.5 0.02", "OPENCV_FISHEYE"),
+        (f"DIVISION {LENS} -0.1", None),
+    ],
+)
+def test_exported_cameras_are_those_of_the_photos_files(tmp_path: Path, camera: str, model: str | None) -> None:
+    """Trained on reduced, undistorted photos: the export read as a scene is the scene, in its full size."""
+    folder = tmp_path / "scene"
+    room.write_colmap(folder, room.write_photos(folder / "images"), camera)
+    source, run = SceneSource(str(folder), downscale=2), tmp_path / "run"
+    create_run(run, RunRecord(source, Config()))
+    save_cameras(run / "cameras.json", source.load().cameras)
+    assert command("export", run, "--format", "cameras", "--out", folder) == 0
+    data = json.loads((folder / "transforms.json").read_text())
+    assert data["camera_model"] == (model or "PINHOLE")
+    if model is None:
+        assert all(
+            frame["file_path"].startswith("undistorted/") and frame["w"] < room.WIDTH for frame in data["frames"]
+        )
+        return
+    original = nw.load_scene(folder, format="colmap")
+    read = nw.load_scene(folder, format="nerfstudio")
+    assert [view.name for view in read.test] == [view.name for view in original.test]
+    for one, other in zip(read.train, original.train, strict=True):
+        torch.testing.assert_close(one.camera.viewmat, other.camera.viewmat, rtol=0, atol=1e-6)
+        assert one.camera.K.allclose(other.camera.K) and one.image.equal(other.image)
 
 
 # Bad input
