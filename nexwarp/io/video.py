@@ -1,11 +1,12 @@
-"""Videos through PyAV: written atomically as H.264, or as VP9 for .webm; read in every format that PyAV knows."""
+"""Videos through PyAV: written atomically as H.264, or as VP9 for .webm; read from common containers."""
 
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -22,8 +23,18 @@ H264 = ("libx264", {"crf": "16", "preset": "medium"})
 VP9 = ("libvpx-vp9", {"crf": "24", "b": "0"})
 
 LARGEST_SIDE = 16384
-BT709, LIMITED_RANGE = 1, 1  # codes of ISO/IEC 23091-2
+# Codes of ISO/IEC 23091-2.
+BT709, UNSPECIFIED, BT601, BT2020 = 1, 2, 6, 9
+LIMITED_RANGE = 1
+HDR = (16, 18)  # transfer functions PQ and HLG
+HD = (720, 1280)  # lines and columns from which players take an untagged video for BT.709
 FASTEST = 1000.0  # frames a second
+
+CONTAINERS = ("mov", "mp4", "matroska", "webm", "avi", "mpegts")  # FFmpeg's names of those that are read
+READ_OPTIONS = {"format_whitelist": ",".join(CONTAINERS), "protocol_whitelist": "file"}
+LARGEST_FRAME = 40_000_000  # pixels; 8K has 33 million
+LONGEST = 2 * 3600  # seconds
+MOST_FRAMES = 60 * LONGEST
 
 
 def check_video(path: str | os.PathLike[str], fps: float) -> None:
@@ -98,8 +109,8 @@ def video_writer(
 def read_frames(path: str | os.PathLike[str]) -> Iterator["av.VideoFrame"]:
     """Decode the frames of a video's first video stream, in the order in which they are shown.
 
-    SettingError: PyAV (extra `video`) is missing. FormatError: the file is no video, has no video stream, or is
-    damaged.
+    SettingError: PyAV (extra `video`) is missing. FormatError: the file is no video in MP4, MOV, Matroska, WebM, AVI or
+    MPEG-TS, has no video stream, is damaged, or has more than 40 megapixels, 2 hours or 432,000 frames.
     """
     _check_av(path)
     import av
@@ -107,19 +118,77 @@ def read_frames(path: str | os.PathLike[str]) -> Iterator["av.VideoFrame"]:
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: no such file, expected a video")
     try:
-        with av.open(str(path)) as container:
+        # "file:" and the lists: what a file names, such as the parts of a playlist, is not opened.
+        with av.open(f"file:{os.path.abspath(path)}", options=READ_OPTIONS) as container:
             if not container.streams.video:
                 raise FormatError(f"{path}: expected a video, but the file has no video stream")
             stream = container.streams.video[0]
+            _check_length(path, (container.duration or 0) / av.time_base, stream.frames)
+            _check_size(path, stream.width, stream.height)
+            stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}
             stream.thread_type = "AUTO"
-            yield from container.decode(stream)
+            for count, frame in enumerate(container.decode(stream), start=1):
+                _check_length(path, frame.time or 0.0, count)
+                _check_size(path, frame.width, frame.height)
+                yield frame
     except av.error.FFmpegError as error:
-        raise FormatError(f"{path}: expected a video, could not decode it ({one_line(error)})") from None
+        raise FormatError(
+            f"{path}: expected a video in {', '.join(CONTAINERS)}, could not decode it ({one_line(error)})"
+        ) from None
+
+
+def _check_size(path: str | os.PathLike[str], width: int, height: int) -> None:
+    if width * height > LARGEST_FRAME:
+        limit = LARGEST_FRAME // 10**6
+        raise FormatError(f"{path}: expected a video of at most {limit} megapixels, got {width}x{height}; reduce it")
+
+
+def _check_length(path: str | os.PathLike[str], seconds: float, count: int) -> None:
+    if seconds > LONGEST or count > MOST_FRAMES:
+        raise FormatError(
+            f"{path}: expected a video of at most {LONGEST:,} s and {MOST_FRAMES:,} frames, got more; cut it"
+        )
 
 
 def frame_pixels(frame: "av.VideoFrame") -> np.ndarray:
-    """Return a frame as (H, W, 3) uint8 sRGB, upright as players show it."""
+    """Return a frame as (H, W, 3) uint8 sRGB, upright as players show it.
+
+    Matrix and range are the frame's; a frame without is BT.709 from 720 lines or 1280 columns on, else BT.601. HDR (HLG
+    and PQ) is converted so that its reference white, 203 nits, becomes white; what is brighter is clipped.
+    """
+    if frame.color_trc in HDR:
+        return _upright(frame, _to_sdr(frame).to_ndarray(format="rgb24"))
+    if frame.colorspace == UNSPECIFIED and "yuv" in frame.format.name:
+        frame.colorspace = BT709 if frame.height >= HD[0] or frame.width >= HD[1] else BT601
     return _upright(frame, frame.to_ndarray(format="rgb24"))
+
+
+def _to_sdr(frame: "av.VideoFrame") -> "av.VideoFrame":
+    """Convert an HDR frame to sRGB with 16 bits a channel."""
+    if frame.colorspace == UNSPECIFIED:
+        frame.colorspace = BT2020
+    if frame.color_primaries == UNSPECIFIED:
+        frame.color_primaries = BT2020
+    graph = _hdr_graph(frame.width, frame.height, frame.format.name, frame.color_trc)
+    graph.push(frame)
+    converted = graph.pull()
+    assert not isinstance(converted, bytes)
+    return cast("av.VideoFrame", converted)
+
+
+@lru_cache(maxsize=1)  # building its tables takes seconds
+def _hdr_graph(width: int, height: int, pixel_format: str, transfer: int) -> "av.filter.Graph":
+    """Return FFmpeg's filters from HDR frames of this kind to sRGB."""
+    import av.filter
+
+    graph = av.filter.Graph()
+    graph.link_nodes(
+        graph.add_buffer(width=width, height=height, format=av.VideoFormat(pixel_format), time_base=Fraction(1, 1000)),
+        graph.add("scale", "out_transfer=iec61966-2-1:out_primaries=bt709:out_range=pc:intent=relative_colorimetric"),
+        graph.add("format", "pix_fmts=rgb48le"),
+        graph.add("buffersink"),
+    ).configure()
+    return graph
 
 
 def frame_luma(frame: "av.VideoFrame", longest: int) -> np.ndarray:

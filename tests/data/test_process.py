@@ -97,7 +97,7 @@ def test_photos_that_are_blurred_or_repeated_are_named_and_kept(tmp_path: Path) 
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])
 def test_frames_stand_upright(turn: int) -> None:
     class Frame:
-        rotation = turn
+        rotation, color_trc, colorspace = turn, 1, 1  # BT.709
 
         @staticmethod
         def to_ndarray(format: str) -> np.ndarray:
