@@ -1,9 +1,8 @@
-"""`nexwarp render`, `export`, `info`, `warmup` and `sfm`."""
+"""`nexwarp render`, `export`, `info` and `warmup`."""
 
 import dataclasses
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
 import tyro
@@ -13,8 +12,7 @@ from nexwarp.cli import display
 from nexwarp.cli.device import pick_device
 from nexwarp.cli.display import describe_exposures, device_name
 from nexwarp.cli.eval import figures
-from nexwarp.cli.options import Device_, Flag_, Preset_, Run_, check_max_hits, option
-from nexwarp.data.sfm import SfmOptions, reconstruct
+from nexwarp.cli.options import Device_, Preset_, Run_, check_max_hits, option
 from nexwarp.run import warmup
 from nexwarp.run.export import ExportOrder, export_run
 from nexwarp.run.folder import RENDERS_FOLDER, read_metrics
@@ -150,25 +148,3 @@ class Warmup:
             f"{time.perf_counter() - start:.1f} s",
             soft_wrap=True,
         )
-
-
-@dataclass
-class Sfm:
-    """Estimate the cameras of photos by structure from motion, and write a scene: undistorted photos, COLMAP model."""
-
-    photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
-    """Folder of the photos (JPEG, PNG, TIFF, BMP), searched with its subfolders."""
-    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Output folder: images/, sparse/0/ and the report sfm.json."""
-    settings: tyro.conf.OmitArgPrefixes[SfmOptions] = dataclasses.field(default_factory=SfmOptions)
-    overwrite: Flag_ = False
-    """Replace SCENE if nexwarp sfm created it."""
-
-    def __call__(self, console: Console) -> None:
-        """Reconstruct."""
-        with display.stages(console) as observe:
-            report = reconstruct(self.photos, self.scene, self.settings, overwrite=self.overwrite, observe=observe)
-        console.print(display.results_table(report.rows(), str(self.scene)))
-        for line in report.lines():
-            console.print(line, soft_wrap=True, markup=False, highlight=False)
-        console.print(f"next: nexwarp train {self.scene}", soft_wrap=True, markup=False, highlight=False)

@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 
 from nexwarp.cli import __version__, display
-from nexwarp.cli.commands import Export, Info, Render, Sfm, Warmup
+from nexwarp.cli.commands import Export, Info, Render, Warmup
 from nexwarp.cli.eval import Eval
 from nexwarp.cli.process import Process
 from nexwarp.cli.signals import deferred_stop, stopped_by_signals
@@ -36,7 +36,7 @@ COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "view": ViewCommand,
     "info": Info,
     "process": Process,
-    "sfm": Sfm,
+    "sfm": Process,
     "warmup": Warmup,
 }
 

@@ -12,28 +12,28 @@ from nexwarp.cli import display
 from nexwarp.cli.options import Flag_, option
 from nexwarp.data.sfm import SfmOptions, process
 from nexwarp.data.sfm.photos import FILMS
-from nexwarp.data.sfm.pipeline import REPORT_FILE
-from nexwarp.data.sfm.process import FRAMES, video_identity
+from nexwarp.data.sfm.process import FRAMES, REPORT_FILE, video_identity
 from nexwarp.errors import RunError
 from nexwarp.io.json_files import READ_ERRORS, read_object
 
 
 @dataclass
 class Process:
-    """Make a scene of a video or of photos: choose sharp frames, then estimate the cameras as `sfm` does.
+    """Make a scene of a video or of photos: choose sharp frames, then estimate the cameras by structure from motion.
 
-    Blurred and repeated frames of a video are left out; among photos, they are named.
+    Blurred and repeated frames of a video are left out; among photos, they are named. `process` and `sfm` are two names
+    of one command.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO|PHOTOS")]
     """A video (extra `video`), or a folder of photos (JPEG, PNG, TIFF, BMP) with its subfolders."""
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Output folder: images/, sparse/0/ and the report sfm.json."""
+    """Output folder: images/ (undistorted), sparse/0/ (a COLMAP model) and the report sfm.json."""
     frames: Annotated[int, option("N")] = FRAMES
     """Number of equal parts of a video, of which each gives its sharpest frame."""
     settings: tyro.conf.OmitArgPrefixes[SfmOptions] = dataclasses.field(default_factory=SfmOptions)
     overwrite: Flag_ = False
-    """Replace SCENE if nexwarp process or sfm created it."""
+    """Replace images/, sparse/ and sfm.json of SCENE if nexwarp wrote all that is in them; other files stay."""
 
     def __call__(self, console: Console) -> None:
         """Make the scene."""

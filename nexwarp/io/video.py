@@ -44,10 +44,11 @@ def check_video(path: str | os.PathLike[str], fps: float) -> None:
         raise SettingError(f"{path}: expected a video ending in {', '.join(KINDS)}, got {suffix or 'no suffix'}")
     if not 0 < fps <= FASTEST:
         raise SettingError(f"fps: expected more than 0 and at most {FASTEST:g} frames a second, got {fps:g}")
-    _check_av(path)
+    check_av(path)
 
 
-def _check_av(path: str | os.PathLike[str]) -> None:
+def check_av(path: str | os.PathLike[str]) -> None:
+    """Raise SettingError unless PyAV is installed; `path` is the video that needs it."""
     try:
         import av  # noqa: F401
     except ImportError:
@@ -112,7 +113,7 @@ def read_frames(path: str | os.PathLike[str]) -> Iterator["av.VideoFrame"]:
     SettingError: PyAV (extra `video`) is missing. FormatError: the file is no video in MP4, MOV, Matroska, WebM, AVI or
     MPEG-TS, has no video stream, is damaged, or has more than 40 megapixels, 2 hours or 432,000 frames.
     """
-    _check_av(path)
+    check_av(path)
     import av
 
     if not Path(path).is_file():
@@ -132,9 +133,8 @@ def read_frames(path: str | os.PathLike[str]) -> Iterator["av.VideoFrame"]:
                 _check_size(path, frame.width, frame.height)
                 yield frame
     except av.error.FFmpegError as error:
-        raise FormatError(
-            f"{path}: expected a video in {', '.join(CONTAINERS)}, could not decode it ({one_line(error)})"
-        ) from None
+        known = f"; the formats {', '.join(CONTAINERS)} are read"
+        raise FormatError(f"{path}: expected a video, could not decode it ({one_line(error)}){known}") from None
 
 
 def _check_size(path: str | os.PathLike[str], width: int, height: int) -> None:

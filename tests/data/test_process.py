@@ -13,8 +13,9 @@ from scipy.ndimage import gaussian_filter, shift
 from nexwarp.cli import main as cli
 from nexwarp.cli.process import is_video
 from nexwarp.data import load_scene
-from nexwarp.data.sfm.frames import choose_frames, motion, sharpness, write_frames
-from nexwarp.data.sfm.process import judge_photos, process
+from nexwarp.data.sfm.frames import motion, sharpness, take_frames
+from nexwarp.data.sfm.photos import judged, read_photos
+from nexwarp.data.sfm.process import process
 from nexwarp.io.video import frame_pixels, read_frames, video_writer
 from tests.cli.support import refused
 
@@ -66,20 +67,21 @@ def test_motion_is_measured_in_pixels(pixels: float) -> None:
 def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
     sharp = {3, 8, 14, 17, 23}
     path = clip(tmp_path / "a.mp4", 25, lambda i, x: x if i in sharp else gaussian_filter(x, 1.0))
-    choice = choose_frames(path, 5, silent)
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    choice = take_frames(path, 5, folder, silent)
     assert set(choice.chosen) == sharp
     assert (choice.frames, choice.blurred, choice.duplicates) == (25, [], [])
-    write_frames(path, choice, tmp_path / "frames", silent)
-    assert sorted(f.name for f in (tmp_path / "frames").iterdir()) == [f"frame_{i:06d}.jpg" for i in sorted(sharp)]
-    assert len(choose_frames(path, 1000, silent).chosen) <= 25
+    assert sorted(f.name for f in folder.iterdir()) == [f"frame_{i:06d}.jpg" for i in sorted(sharp)]
+    assert len(take_frames(path, 1000, tmp_path, silent).chosen) <= 25
 
 
 def test_blurred_and_repeated_frames_are_left_out_and_named(tmp_path: Path) -> None:
     picture = texture()[20:140, :160]
     path = clip(tmp_path / "a.mp4", 24, lambda i, x: gaussian_filter(x, 5.0) if i in (9, 10) else x)
-    assert choose_frames(path, 24, silent).blurred == [9, 10]
+    assert take_frames(path, 24, tmp_path, silent).blurred == [9, 10]
     still = clip(tmp_path / "b.mp4", 12, lambda i, x: picture if i < 6 else x, step=4)
-    choice = choose_frames(still, 12, silent)
+    choice = take_frames(still, 12, tmp_path, silent)
     assert choice.duplicates == [1, 2, 3, 4, 5] and choice.chosen == [0, *range(6, 12)]
 
 
@@ -91,7 +93,7 @@ def test_photos_that_are_blurred_or_repeated_are_named_and_kept(tmp_path: Path) 
         window = picture[20:140, 10 * min(index, 4) : 10 * min(index, 4) + 160]
         window = gaussian_filter(window, 5.0) if index == 2 else window
         Image.fromarray(window.astype(np.uint8)).convert("RGB").save(tmp_path / name)
-    assert judge_photos(tmp_path, names, silent) == (["2.png"], ["5.png"])
+    assert judged(read_photos(tmp_path, names, 1, lambda done: None)) == (["2.png"], ["5.png"])
 
 
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])
@@ -146,12 +148,12 @@ def test_videos_are_known_by_their_suffix(tmp_path: Path) -> None:
 def test_a_clip_becomes_a_scene(tmp_path: Path) -> None:
     """Nine tenths of the frames kept are registered."""
     report = process(Path(__file__).parent / "photos" / "walk.mp4", tmp_path / "scene", 12)
-    assert report.choice is not None
-    assert len(report.sfm.registered) >= 0.9 * len(report.choice.chosen) >= 0.9 * 12
+    assert report.frames is not None
+    assert len(report.registered) >= 0.9 * len(report.frames.chosen) >= 0.9 * 12
     scene = load_scene(tmp_path / "scene")
-    assert len(scene.train) + len(scene.test) == len(report.sfm.registered)
+    assert len(scene.train) + len(scene.test) == len(report.registered)
     notes = json.loads((tmp_path / "scene" / "sfm.json").read_text())
-    assert notes["video"]["name"] == "walk.mp4" and notes["frames"]["chosen"] == report.choice.chosen
+    assert notes["video"]["name"] == "walk.mp4" and notes["frames"]["chosen"] == report.frames.chosen
 
 
 def test_pixels_of_a_video_come_back(tmp_path: Path) -> None:

@@ -2,8 +2,12 @@
 
 import dataclasses
 import json
+import os
 import shutil
 import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +23,14 @@ from nexwarp.data.colmap import read_model
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.sfm import SfmOptions, reconstruct
 from nexwarp.data.sfm.pairs import components, exhaustive_pairs, sequential_pairs
-from nexwarp.data.sfm.photos import list_photos
+from nexwarp.data.sfm.photos import affordable_threads, list_photos
 from nexwarp.data.sfm.report import Overlaps, advise, left_out
+from nexwarp.errors import OutOfMemoryError, SceneError, StorageError
 from tests.cli.support import refused, snapshot
+from tests.subprocesses import python_path
+
+ROOT = Path(__file__).parents[2]
+processing = sys.modules["nexwarp.data.sfm.process"]  # the package has a function of that name
 
 WIDTH, HEIGHT, FOCAL, VIEWS = 320, 240, 320.0, 7
 PHOTOS = Path(__file__).parent / "photos"
@@ -362,22 +371,220 @@ def test_an_interrupt_leaves_nothing(stage, photos, tmp_path, monkeypatch):
 
 
 def test_what_exists_is_replaced_only_when_asked(made, photos, tmp_path, capsys):
+    """With --overwrite the scene's own files are replaced, and all else in its folder stays."""
     scene, precious = tmp_path / "scene", tmp_path / "precious"
     shutil.copytree(made, scene)
     precious.mkdir()
     (precious / "thesis.tex").write_text("years of work")
+    for name in ("masks/view 5.png", "runs/a/model.safetensors", "notes.txt"):
+        (scene / name).parent.mkdir(parents=True, exist_ok=True)
+        (scene / name).write_text("work")
+    (scene / "link").symlink_to(precious)
     before = snapshot(tmp_path)
     refused(capsys, ["sfm", str(photos), str(scene)], str(scene), "exists", "--overwrite")
     refused(capsys, ["sfm", str(photos), str(precious), "--overwrite"], "holds no sfm.json; not touching it")
     (tmp_path / "empty").mkdir()
     refused(capsys, ["sfm", str(tmp_path / "empty"), str(scene), "--overwrite"], "expected at least 3 photos")
     assert snapshot(tmp_path) == before
-    (scene / "images" / "old.png").touch()
-    assert cli.main(["sfm", str(photos), str(scene), "--overwrite", "--camera-model", "simple_pinhole"]) == 0
-    assert {entry.name for entry in (scene / "images").iterdir()} == {
-        entry.name for entry in (made / "images").iterdir()
+    command = ["sfm", str(photos), str(scene), "--overwrite", "--camera-model", "simple_pinhole"]
+    assert cli.main([*command, "--seed", "1"]) == 0
+    after = snapshot(tmp_path)
+    assert json.loads(after["scene/sfm.json"])["options"]["seed"] == 1
+    assert {name for name in before if before[name] != after.get(name)} <= {"scene/sfm.json", *reconstructed(scene)}
+    assert after.keys() == before.keys() and {entry.name for entry in tmp_path.iterdir()} == {
+        "scene",
+        "precious",
+        "empty",
     }
-    assert {entry.name for entry in tmp_path.iterdir()} == {"scene", "precious", "empty"}
+
+
+def reconstructed(scene: Path) -> set[str]:
+    return {f"scene/{file.relative_to(scene)}" for file in (scene / "sparse").rglob("*")}
+
+
+def a_new_picture(scene: Path) -> None:
+    (scene / "images" / "old.png").write_bytes(b"work")
+
+
+def a_changed_picture(scene: Path) -> None:
+    picture = scene / "images" / "view 5.png"
+    picture.write_bytes(bytes(picture.stat().st_size))
+
+
+def a_link_for_the_pictures(scene: Path) -> None:
+    (scene / "images").rename(scene.parent / "elsewhere")
+    (scene / "images").symlink_to(scene.parent / "elsewhere")
+
+
+def a_report_of_others(scene: Path) -> None:
+    (scene / "sfm.json").write_text("{}")
+
+
+@pytest.mark.parametrize("change", [a_new_picture, a_changed_picture, a_link_for_the_pictures, a_report_of_others])
+def test_files_of_others_are_not_overwritten(change, made, photos, tmp_path, capsys):
+    shutil.copytree(made, tmp_path / "scene")
+    change(tmp_path / "scene")
+    before = snapshot(tmp_path)
+    refused(capsys, ["sfm", str(photos), str(tmp_path / "scene"), "--overwrite"], str(tmp_path / "scene"))
+    assert snapshot(tmp_path) == before
+
+
+# What happens meanwhile. Instead of COLMAP, a process that copies the photos and is quick.
+
+STAND_IN = """
+import os, shutil
+from nexwarp.data.sfm import child, stages
+from nexwarp.data.sfm.report import SfmReport
+def run(self, names):
+    self.observe("features", 0, 1)
+    scene = self.folder / "scene"
+    shutil.copytree(self.photos, scene / "images")
+    (scene / "sparse").mkdir()
+    {fault}
+    return SfmReport(1, [], {{}}, 0, 0.0, 0.0, [], [], [], 0, 0, "exhaustive", {{}}, [], [], [])
+stages.Stages.run = run
+child.main()
+"""
+
+
+@pytest.fixture
+def quick(monkeypatch, arc, tmp_path):
+    """A function that makes a scene of photos in `tmp_path` with a stand-in for COLMAP, which has a fault."""
+    folder = write_photos(tmp_path / "photos", dict(list(arc.images.items())[:3]))
+
+    def make(fault: str = "pass", scene: str = "new/scene", **options: Any) -> None:
+        monkeypatch.setattr(processing, "CHILD", (sys.executable, "-c", STAND_IN.format(fault=fault)))
+        reconstruct(folder, tmp_path / scene, PINHOLE, **options)
+
+    return make
+
+
+def test_two_processes_do_not_make_one_scene(quick, tmp_path):
+    def second(stage: str, done: int, total: int) -> None:
+        with pytest.raises(FileExistsError, match="scene: another process is making this scene"):
+            quick()
+
+    quick(observe=second)
+    assert {entry.name for entry in (tmp_path / "new").iterdir()} == {"scene"}
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_what_appears_meanwhile_stays(quick, tmp_path, overwrite):
+    precious = tmp_path / "new" / "scene" / "images" / "precious.txt"
+    if overwrite:
+        quick()
+
+    def appear(stage: str, done: int, total: int) -> None:
+        precious.parent.mkdir(parents=True, exist_ok=True)
+        precious.write_text("work")
+        expected.update(snapshot(tmp_path))
+
+    expected: dict[str, bytes] = {}
+    with pytest.raises(FileExistsError, match=r"not touching it|only files as nexwarp wrote them"):
+        quick(observe=appear, overwrite=overwrite)
+    assert {name: data for name, data in snapshot(tmp_path).items() if ".making" not in name} == {
+        name: data for name, data in expected.items() if ".making" not in name
+    }
+    assert [entry.name for entry in (tmp_path / "new").iterdir()] == ["scene"] and precious.is_file()
+
+
+CHANGES = {
+    "a photo shrinks": lambda photo: photo.write_bytes(photo.read_bytes()[:2000]),
+    "a photo vanishes": lambda photo: photo.unlink(),
+    "a photo is replaced": lambda photo: (shutil.copy(photo, photo.with_suffix(".new"))) and (
+        photo.with_suffix(".new").replace(photo)
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", ["pass", "os.abort()"])
+@pytest.mark.parametrize("kind", CHANGES)
+def test_photos_that_change_meanwhile_are_told(kind, fault, quick, tmp_path):
+    def change(stage: str, done: int, total: int) -> None:
+        CHANGES[kind](tmp_path / "photos" / "view 6.png")
+
+    with pytest.raises(SceneError, match=r"view 6\.png: changed or vanished while the scene was made of it"):
+        quick(fault, observe=change)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["photos"]
+
+
+@pytest.mark.parametrize(
+    ("fault", "error", "message"),
+    [
+        ("os.abort()", SceneError, "pycolmap failed: its process ended with signal SIGABRT"),
+        ("os.kill(os.getpid(), 9)", SceneError, "signal SIGKILL .* too little memory"),
+        ("os.write(2, b'what():  database or disk is full'); os.abort()", StorageError, "No space left on device"),
+        ("raise OSError(28, 'No space left on device')", StorageError, "scene: cannot be written .No space left"),
+        ("raise RuntimeError('No registered database factory')", ValueError, "pycolmap failed: No registered"),
+        ("raise MemoryError", OutOfMemoryError, "MemoryError"),
+    ],
+)
+def test_an_abort_is_one_line_and_leaves_nothing(fault, error, message, quick, tmp_path):
+    with pytest.raises(error, match=message) as caught:
+        quick(fault)
+    assert "\n" not in str(caught.value) and [entry.name for entry in tmp_path.iterdir()] == ["photos"]
+
+
+def test_a_limit_of_file_sizes_is_one_line_and_leaves_nothing(photos, tmp_path):
+    code = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (99999, 99999)); "
+    code += "from nexwarp.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "process", str(photos), str(tmp_path / "scene")]
+    done = subprocess.run(command, env=os.environ | python_path(ROOT), capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (
+        2,
+        f"nexwarp: error: {tmp_path / 'scene'}: cannot be written (File too large)\n",
+    )
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a process group is ended there")
+def test_a_killed_process_leaves_nothing(photos, tmp_path):
+    command = [sys.executable, "-m", "nexwarp", "process", str(photos), str(tmp_path / "scene")]
+    process = subprocess.Popen(command, env=os.environ | python_path(ROOT), stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60.0
+    while not list(tmp_path.glob(".*/*/database.db")):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    while list(tmp_path.iterdir()):
+        assert time.monotonic() < deadline, list(tmp_path.rglob("*"))
+        time.sleep(0.01)
+
+
+# Files and memory
+
+
+@pytest.mark.parametrize("name", ["a\x1b[2J.png", "a\nb.png", "b" * 241 + ".png", "c\udcff.png", "link.png"])
+def test_names_and_links_that_train_refuses_are_refused(name, tmp_path):
+    folder = write_photos(tmp_path / "photos", {f"{i}.png": noise(0)[:8, :8] for i in range(3)})
+    Image.fromarray(noise(0)[:8, :8]).save(tmp_path / "outside.png")
+    if name == "link.png":
+        (folder / name).symlink_to(tmp_path / "outside.png")
+    else:
+        shutil.copy(tmp_path / "outside.png", folder / name)
+    with pytest.raises(ValueError, match=r"photos: photo .*(path|bytes|link)") as caught:
+        list_photos(folder)
+    assert str(caught.value).isprintable()
+
+
+def test_memory_of_decoding_is_bounded_by_the_sizes_of_the_photos(tmp_path, monkeypatch):
+    """As many threads hold a photo as the memory has room for; the sizes are those of the headers."""
+    names = []
+    for side in (1000, 12000):
+        names.append(f"{side}.png")
+        Image.new("1", (side, side)).save(tmp_path / names[-1])
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    monkeypatch.setattr("nexwarp.data.sfm.photos.available_memory", lambda: 200 * 2**30)
+    options = SfmOptions(max_image_size=64)
+    assert affordable_threads(tmp_path, names[:1], options) == 64
+    assert affordable_threads(tmp_path, names, options) == 1  # 1.6 GiB each
+    monkeypatch.setattr("nexwarp.data.sfm.photos.available_memory", lambda: 2**30)
+    assert affordable_threads(tmp_path, names[:1], SfmOptions()) == 3  # 240 MB each, with features
+    with pytest.raises(
+        OutOfMemoryError, match=r"12000\.png: 144 megapixels need 1\.6 GiB of memory, of which 1\.0 GiB"
+    ):
+        affordable_threads(tmp_path, names, options)
 
 
 def test_a_failure_keeps_the_scene_it_should_replace(made, tmp_path, capsys):

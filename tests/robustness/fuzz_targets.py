@@ -318,7 +318,7 @@ TARGETS = {
         FuzzTarget(
             "photos",
             _photo_files,
-            lambda folder: camera_groups(folder, read_photos(folder, ["a.jpg"], lambda _: None), "auto"),
+            lambda folder: camera_groups(folder, read_photos(folder, ["a.jpg"], 1, lambda _: None), "auto"),
             (".jpg",),
         ),
         FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),

@@ -1,8 +1,7 @@
-"""Structure from motion with pycolmap on the CPU: from photos to a COLMAP scene."""
+"""Structure from motion with pycolmap on the CPU: from photos or a video to a COLMAP scene."""
 
 from nexwarp.data.sfm.options import SfmOptions
-from nexwarp.data.sfm.pipeline import reconstruct
-from nexwarp.data.sfm.process import ProcessReport, process
+from nexwarp.data.sfm.process import process, reconstruct
 from nexwarp.data.sfm.report import SfmReport
 
-__all__ = ["ProcessReport", "SfmOptions", "SfmReport", "process", "reconstruct"]
+__all__ = ["SfmOptions", "SfmReport", "process", "reconstruct"]

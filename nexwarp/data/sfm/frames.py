@@ -10,7 +10,7 @@ import torch
 
 from nexwarp.errors import SceneError, SettingError
 from nexwarp.io.pictures import save_jpeg
-from nexwarp.io.video import frame_luma, frame_pixels, read_frames
+from nexwarp.io.video import check_av, frame_luma, frame_pixels, read_frames
 
 SIDE = 640  # pixels of the longer side at which sharpness is measured: a blur below two of its pixels hardly shows
 THUMBNAIL = 160  # pixels of the longer side at which motion is measured
@@ -77,14 +77,25 @@ def motion(luma: np.ndarray, before: np.ndarray) -> float:
     return float(np.mean(np.abs(second - first))) / max(gradient, FLAT)
 
 
-def choose_frames(path: str | os.PathLike[str], count: int, observe: Callable[[str, int, int], None]) -> FrameChoice:
-    """Divide a video into `count` parts of equal length, and choose the sharpest frame of each.
+def check_frames(path: str | os.PathLike[str], count: int) -> None:
+    """Raise SettingError if a video cannot be divided into `count` parts, or PyAV is missing."""
+    if count < FEWEST:
+        raise SettingError(f"--frames: expected at least {FEWEST}, got {count}")
+    check_av(path)
 
-    A chosen frame is left out if it is much less sharp than its neighbours, or nearly the same as the one before.
+
+def take_frames(
+    path: str | os.PathLike[str], count: int, folder: Path, observe: Callable[[str, int, int], None]
+) -> FrameChoice:
+    """Divide a video into `count` parts of equal length, and write the sharpest frame of each into a folder.
+
+    A frame is left out if it is much less sharp than its neighbours, or nearly the same as the one before. The files
+    are frame_NUMBER.jpg. The video is decoded twice, so that no frame is kept in memory.
 
     Args:
         path: the video.
         count: number of parts, at least 3; a video with fewer frames has a part for each frame.
+        folder: folder to write.
         observe: called with the stage's name, the number of frames read and their total, which is not known before.
 
     Raises:
@@ -92,57 +103,38 @@ def choose_frames(path: str | os.PathLike[str], count: int, observe: Callable[[s
         FormatError: the file is no video, or is damaged.
         SceneError: fewer than 3 frames are left.
     """
-    if count < FEWEST:
-        raise SettingError(f"--frames: expected at least {FEWEST}, got {count}")
+    check_frames(path, count)
     scores: list[float] = []
-    thumbnails: list[np.ndarray] = []
     seconds = 0.0
     for frame in read_frames(path):
         scores.append(sharpness(frame_luma(frame, SIDE)))
-        thumbnails.append(frame_luma(frame, THUMBNAIL))
         seconds = max(seconds, frame.time or 0.0)
         observe("reading the video", len(scores), len(scores))
-    candidates = [part[int(np.argmax([scores[i] for i in part]))] for part in _parts(len(scores), count)]
+    candidates = [max(part, key=scores.__getitem__) for part in _parts(len(scores), count)]
     blurred = [
         index
         for place, index in enumerate(candidates)
         if scores[index] < BLURRED * np.median([scores[i] for i in _around(candidates, place)])
     ]
+    sharp = [index for index in candidates if index not in blurred]
     chosen: list[int] = []
-    duplicates: list[int] = []
-    for index in candidates:
-        if index in blurred:
-            continue
-        if chosen and motion(thumbnails[index], thumbnails[chosen[-1]]) < STILL:
-            duplicates.append(index)
-        else:
-            chosen.append(index)
+    before: np.ndarray | None = None
+    for index, frame in enumerate(read_frames(path)):
+        if index in sharp:
+            thumbnail = frame_luma(frame, THUMBNAIL)
+            if before is None or motion(thumbnail, before) >= STILL:
+                save_jpeg(folder / f"frame_{index:06d}.jpg", torch.from_numpy(frame_pixels(frame)), JPEG_QUALITY)
+                chosen.append(index)
+                before = thumbnail
+            observe("writing frames", sharp.index(index) + 1, len(sharp))
+            if index == sharp[-1]:
+                break
     if len(chosen) < FEWEST:
         raise SceneError(
             f"{path}: expected a video of a moving camera, got {len(scores)} frames, of which {len(chosen)} are sharp "
             "and differ"
         )
-    return FrameChoice(len(scores), seconds, chosen, blurred, duplicates)
-
-
-def write_frames(
-    path: str | os.PathLike[str], choice: FrameChoice, folder: Path, observe: Callable[[str, int, int], None]
-) -> None:
-    """Write the chosen frames of a video into a folder, as frame_NUMBER.jpg in the order of the video."""
-    wanted = set(choice.chosen)
-    done = 0
-    for index, frame in enumerate(read_frames(path)):
-        if index in wanted:
-            save_jpeg(folder / frame_name(index), torch.from_numpy(frame_pixels(frame)), JPEG_QUALITY)
-            done += 1
-            observe("writing frames", done, len(wanted))
-            if done == len(wanted):
-                return
-
-
-def frame_name(index: int) -> str:
-    """Return the file name of a frame."""
-    return f"frame_{index:06d}.jpg"
+    return FrameChoice(len(scores), seconds, chosen, blurred, [index for index in sharp if index not in chosen])
 
 
 def _parts(total: int, count: int) -> list[range]:

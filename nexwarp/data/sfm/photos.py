@@ -1,16 +1,27 @@
 """The photos of a reconstruction: listing, decoding, EXIF, and grouping by camera."""
 
+import math
+import os
 import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 
-from nexwarp.data.images import read_image
+import numpy as np
+
+from nexwarp.data.capture import safe_name, short
+from nexwarp.data.images import downscale_image, image_size, read_image
 from nexwarp.data.lens import pycolmap_module
+from nexwarp.data.memory import GIB, SHARE
+from nexwarp.data.sfm.frames import BLURRED, SIDE, STILL, THUMBNAIL, motion, reduced_luma, sharpness
 from nexwarp.data.sfm.options import SfmOptions
+from nexwarp.errors import OutOfMemoryError
+from nexwarp.machine import available_memory
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")  # formats that both PIL and pycolmap 4.2 decode
 CONVERTIBLE = (".heic", ".heif", ".webp", ".avif", ".gif", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
@@ -18,6 +29,9 @@ FILMS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 MIN_PHOTOS = 3
 MANY = 5  # photos of one camera that determine the eight parameters of OPENCV
 MAKE, MODEL = 271, 272  # EXIF tags
+PIXEL_BYTES = 12  # of memory, to decode or undistort a photo, a pixel
+FEATURE_BYTES = 240  # of memory, to find SIFT features, a pixel of the reduced photo
+MOST_DECODED = 2 * GIB  # memory of the photos that are decoded at once, if there are several
 
 
 @dataclass(frozen=True)
@@ -29,12 +43,16 @@ class InputPhoto:
         size: width and height in pixels; EXIF orientation is not applied.
         device: make and model of the camera from EXIF, empty if absent.
         focal: focal length in pixels from EXIF; None if absent.
+        sharpness: as of `frames.sharpness`.
+        thumbnail: (h, w) uint8 brightness, reduced to 160 pixels.
     """
 
     name: str
     size: tuple[int, int]
     device: tuple[str, str]
     focal: float | None
+    sharpness: float
+    thumbnail: np.ndarray
 
 
 def list_photos(folder: Path) -> list[str]:
@@ -42,7 +60,7 @@ def list_photos(folder: Path) -> list[str]:
 
     Raises:
         FileNotFoundError: no such folder.
-        ValueError: it has fewer than 3 photos.
+        ValueError: it has fewer than 3 photos, or one that is a link out of it or has a name that no scene can have.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder, expected one with photos")
@@ -55,6 +73,10 @@ def list_photos(folder: Path) -> list[str]:
         others += [f"{kinds[s]} {s}: give the film itself to nexwarp process" for s in FILMS if kinds[s]]
         there = "; ".join([f"{len(names) or 'none'}", *others])
         raise ValueError(f"{folder}: expected at least {MIN_PHOTOS} photos ({', '.join(SUFFIXES)}), found {there}")
+    for name in names:
+        safe_name(f"{folder}: photo", name, "folder of the photos")
+        if not (folder / name).resolve().is_relative_to(folder.resolve()):
+            raise ValueError(f"{folder}: photo {short(name)}: a link leaves the folder; put the photo itself there")
     return names
 
 
@@ -63,19 +85,39 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", name)] + [(-1, name)]
 
 
-def read_photos(folder: Path, names: Sequence[str], done: Callable[[int], None]) -> list[InputPhoto]:
+def affordable_threads(folder: Path, names: Sequence[str], options: SfmOptions) -> int:
+    """Return how many threads may hold a photo at once, by the sizes that the files' headers give.
+
+    OutOfMemoryError: there is too little memory for the largest photo.
+    """
+    name, pixels = max(((name, math.prod(image_size(folder / name))) for name in names), key=lambda item: item[1])
+    searched = min(pixels, options.max_image_size**2)
+    each = PIXEL_BYTES * pixels + FEATURE_BYTES * searched
+    free = available_memory()
+    if each > free:
+        raise OutOfMemoryError(
+            f"{folder / name}: {pixels / 1e6:.0f} megapixels need {each / GIB:.1f} GiB of memory, of which "
+            f"{free / GIB:.1f} GiB are free; reduce the photos, or give a smaller --max-image-size",
+            f"{each / GIB:.1f} GiB",
+        )
+    most = options.threads or os.cpu_count() or 1
+    return max(1, min(most, int(SHARE * free) // each, max(MOST_DECODED // (PIXEL_BYTES * pixels), 1)))
+
+
+def read_photos(folder: Path, names: Sequence[str], threads: int, done: Callable[[int], None]) -> list[InputPhoto]:
     """Decode every photo, so that a damaged one is reported before the reconstruction, and read its EXIF.
 
     Args:
         folder: folder of the photos.
         names: their names below it.
+        threads: number of photos that are decoded at once.
         done: called with the number of photos that were read.
 
     Raises:
         ValueError: a photo cannot be decoded.
     """
     photos: list[InputPhoto] = []
-    with ThreadPoolExecutor() as pool:  # decoding releases the GIL
+    with ThreadPoolExecutor(threads) as pool:  # decoding releases the GIL
         jobs = [pool.submit(_read_photo, folder, name) for name in names]
         try:
             for count, job in enumerate(jobs, start=1):
@@ -88,17 +130,31 @@ def read_photos(folder: Path, names: Sequence[str], done: Callable[[int], None])
 
 
 def _read_photo(folder: Path, name: str) -> InputPhoto:
-    pycolmap = pycolmap_module()
     path = folder / name
-    height, width = read_image(path).shape[:2]
+    pixels = read_image(path)
+    height, width = pixels.shape[:2]
+    luma = downscale_image(pixels, max(max(height, width) // SIDE, 1)).float().mean(-1).byte().numpy()
+    del pixels  # before pycolmap reads it
     try:
-        camera = pycolmap.infer_camera_from_image(str(path))
+        camera = pycolmap_module().infer_camera_from_image(str(path))
     except (ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: pycolmap cannot decode it; save it anew as JPEG or PNG, or remove it") from error
     if (camera.width, camera.height) != (width, height):
         raise ValueError(f"{path}: expected {width}x{height}, pycolmap reads {camera.width}x{camera.height}")
     focal = camera.focal_length if camera.has_prior_focal_length else None
-    return InputPhoto(name, (width, height), _device(path), focal)
+    score, thumbnail = sharpness(reduced_luma(luma)), reduced_luma(luma, THUMBNAIL)
+    return InputPhoto(name, (width, height), _device(path), focal, score, thumbnail)
+
+
+def judged(photos: Sequence[InputPhoto]) -> tuple[list[str], list[str]]:
+    """Return the names of photos that are blurred, and of those that repeat the photo before."""
+    limit = BLURRED * median(photo.sharpness for photo in photos)
+    repeated = [
+        photo.name
+        for before, photo in pairwise(photos)
+        if before.thumbnail.shape == photo.thumbnail.shape and motion(photo.thumbnail, before.thumbnail) < STILL
+    ]
+    return [photo.name for photo in photos if photo.sharpness < limit], repeated
 
 
 def _device(path: Path) -> tuple[str, str]:

@@ -1,59 +1,55 @@
-"""From a video or a folder of photos to a scene: choice of frames, then structure from motion."""
+"""From a video or a folder of photos to a scene. The work is done by a process of its own (`child`).
 
-import dataclasses
+An abort in the libraries that decode and reconstruct ends that process alone; this one claims the scene's name, shows
+the progress, and puts the finished scene in its place.
+"""
+
+import errno
+import hashlib
+import json
 import os
+import re
+import shutil
+import subprocess
+import sys
 import tempfile
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
-from typing import cast
+from signal import Signals
+from threading import Thread
+from typing import Any
+from zlib import crc32
 
-import numpy as np
+from filelock import FileLock, Timeout
 
-from nexwarp.data.images import read_image
-from nexwarp.data.sfm.frames import (
-    BLURRED,
-    STILL,
-    THUMBNAIL,
-    FrameChoice,
-    choose_frames,
-    motion,
-    reduced_luma,
-    sharpness,
-    write_frames,
-)
+from nexwarp import errors
+from nexwarp.data.sfm.frames import check_frames
 from nexwarp.data.sfm.options import SfmOptions
 from nexwarp.data.sfm.photos import list_photos
-from nexwarp.data.sfm.pipeline import Observer, check_target, parents, reconstruct
 from nexwarp.data.sfm.report import SfmReport
-from nexwarp.io.json_files import Json
+from nexwarp.data.sfm.stages import PYCOLMAP, Observer
+from nexwarp.errors import SceneError, StorageError
+from nexwarp.io.files import make_folders, one_line, remove_empty
+from nexwarp.io.json_files import READ_ERRORS, Json, read_object
 
+REPORT_FILE = "sfm.json"
+PARTS = ("images", "sparse", REPORT_FILE)  # of a scene
 FRAMES = 120  # parts of a video, of which each gives a photo
+LOCK_FILE, REPLACED = "lock", "replaced"  # in the folder that claims a name
+MAX_STEM = 40  # characters of the scene's name in that folder's name
 
-
-@dataclasses.dataclass(frozen=True)
-class ProcessReport:
-    """What became of a video or of photos.
-
-    Attributes:
-        choice: the frames of a video; None for photos.
-        blurred: names of photos that are much less sharp than the others; they are used all the same.
-        repeated: names of photos that show nearly the same as the one before; they are used all the same.
-        sfm: report of the reconstruction.
-    """
-
-    choice: FrameChoice | None
-    blurred: list[str]
-    repeated: list[str]
-    sfm: SfmReport
-
-    def rows(self) -> dict[str, str]:
-        """The figures as rows of a table: name -> text."""
-        return ({} if self.choice is None else self.choice.rows()) | self.sfm.rows()
-
-    def lines(self) -> list[str]:
-        """What is left out or suspicious, and advice, one line each."""
-        lines = [f"blurred: {name}; kept" for name in self.blurred]
-        lines += [f"repeats the photo before: {name}; kept" for name in self.repeated]
-        return lines + self.sfm.lines()
+CHILD = (sys.executable, "-c", "from nexwarp.data.sfm.child import main; main()")
+LAST_LINES = 200  # of what a process writes to stderr, in which the reason of its end is searched
+FULL = re.compile(r"No space left|disk is full|File too large|File size limit|disk I/O error", re.I)
+REASON = re.compile(f"Check failed|what\\(\\):|{FULL.pattern}", re.I)
+FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP)  # of a file system
+KILLED = 9  # SIGKILL, also of the system when memory runs out
+PROBE = 2**20  # bytes that are written after a failure of pycolmap, to see whether the disk is full
+RAISED = ("SceneError", "FormatError", "SettingError", "OutOfMemoryError")
 
 
 def process(
@@ -64,44 +60,78 @@ def process(
     *,
     overwrite: bool = False,
     observe: Observer = lambda stage, done, total: None,
-) -> ProcessReport:
-    """Make a scene of a video or a folder of photos.
+) -> SfmReport:
+    """Estimate the cameras and points of a video or of photos, and write a COLMAP scene for `load_scene`.
 
-    Of a video, `choose_frames` takes sharp frames that differ, which are then compared with their neighbours in time
+    Of a video, `take_frames` takes sharp frames that differ, which are then compared with their neighbours in time
     only, unless the options say otherwise. Photos are all used; blurred and repeated ones are named.
 
+    The scene holds images/ (undistorted, with the given names), sparse/0 (PINHOLE cameras) and sfm.json (the report,
+    the options, and size and SHA-256 of each file). It is made in a folder beside `scene`, which no second call for the
+    same scene gets, and renamed at the end. A failure or interruption leaves nothing, and so does the end of this
+    process, but for a scene that was being replaced in that very moment: it stays in the folder beside.
+
     Args:
-        source: a video file, or a folder of photos as `reconstruct` takes it.
+        source: a video file, or a folder of photos, searched with its subfolders; hidden files are ignored.
         scene: folder to write; must be empty or absent.
         frames: number of parts of a video that give a photo each.
-        options: settings of the reconstruction; None is the defaults.
-        overwrite: replace `scene` if nexwarp made it of photos or a video.
+        options: settings; None is the defaults.
+        overwrite: replace images/, sparse/ and sfm.json of `scene` if nexwarp wrote all that is in them; other files of
+            `scene` stay.
         observe: called repeatedly with the stage's name, the number of finished items and their total.
 
+    Returns:
+        The report.
+
     Raises:
-        ValueError, OSError: those of `choose_frames` and `reconstruct`; nothing is written then.
+        FileNotFoundError: no such `source`.
+        FileExistsError: `scene` exists, may not be replaced, or is being made by another process.
+        ValueError: an option out of range, fewer than 3 photos, a photo that cannot be decoded, has a name that no
+            scene can have, is a link out of the folder, or changed meanwhile, photos of one camera that differ in size,
+            a video that is damaged or shows fewer than 3 sharp frames, or no model was found; then the message gives
+            advice.
+        StorageError: the disk is full.
+        MemoryError: a photo needs more memory than there is.
     """
-    source, scene, options = Path(source), Path(scene), options or SfmOptions()
+    source, options = Path(source), options or SfmOptions()
+    scene = Path(scene).resolve() if Path(scene).is_symlink() else Path(scene)
     options.check()
-    if not source.is_file():
-        names = list_photos(source)
-        check_target(source, scene, overwrite)
-        blurred, repeated = judge_photos(source, names, observe)
-        notes: dict[str, Json] = {"blurred": list(blurred), "repeated": list(repeated)}
-        report = reconstruct(source, scene, options, overwrite=overwrite, observe=observe, notes=notes)
-        return ProcessReport(None, blurred, repeated, report)
-    check_target(source, scene, overwrite)
-    choice = choose_frames(source, frames, observe)
-    if options.matching == "auto":
-        options = dataclasses.replace(options, matching="sequential")
-    with (
-        parents(scene),
-        tempfile.TemporaryDirectory(dir=scene.parent, prefix=f".{scene.name}-frames-") as folder,
-    ):
-        write_frames(source, choice, Path(folder), observe)
-        notes = {"video": video_identity(source), "frames": cast(Json, dataclasses.asdict(choice))}
-        report = reconstruct(folder, scene, options, overwrite=overwrite, observe=observe, notes=notes)
-    return ProcessReport(choice, [], [], report)
+    video = source.is_file()
+    names = [] if video else list_photos(source)
+    if video:
+        check_frames(source, frames)
+    _check_target(source, scene, overwrite)
+    inputs = [source / name for name in names] or [source]
+    before = {file: _identity(file) for file in inputs}
+    with _claimed(scene) as folder:
+        order: dict[str, Json] = {
+            "source": str(source.absolute()),
+            "photos": list(names),
+            "folder": str(folder),
+            "frames": frames,
+            "options": asdict(options),
+            "video": video_identity(source) if video else None,
+        }
+        try:
+            answer = _in_child(source, scene, order, observe)
+        except Exception:
+            _check_unchanged(before)
+            raise
+        _check_unchanged(before)
+        _publish(folder / "scene", scene, folder / REPLACED if overwrite else None)
+    return SfmReport.of(answer)
+
+
+def reconstruct(
+    photos: str | os.PathLike[str],
+    scene: str | os.PathLike[str],
+    options: SfmOptions | None = None,
+    *,
+    overwrite: bool = False,
+    observe: Observer = lambda stage, done, total: None,
+) -> SfmReport:
+    """Make a scene of a folder of photos; as `process`, which also takes videos."""
+    return process(photos, scene, options=options, overwrite=overwrite, observe=observe)
 
 
 def video_identity(path: Path) -> dict[str, Json]:
@@ -110,18 +140,216 @@ def video_identity(path: Path) -> dict[str, Json]:
     return {"name": path.name, "bytes": status.st_size, "modified": status.st_mtime}
 
 
-def judge_photos(folder: Path, names: list[str], observe: Observer) -> tuple[list[str], list[str]]:
-    """Return the names of photos that are blurred, and of those that repeat the photo before."""
-    scores: list[float] = []
-    repeated: list[str] = []
-    before: np.ndarray | None = None
-    for done, name in enumerate(names, start=1):
-        luma = read_image(folder / name).float().mean(-1).byte().numpy()
-        scores.append(sharpness(reduced_luma(luma)))
-        small = reduced_luma(luma, THUMBNAIL)
-        if before is not None and before.shape == small.shape and motion(small, before) < STILL:
-            repeated.append(name)
-        before = small
-        observe("judging photos", done, len(names))
-    limit = BLURRED * float(np.median(scores))
-    return [name for name, score in zip(names, scores, strict=True) if score < limit], repeated
+def file_facts(file: Path) -> list[Json]:
+    """Size and SHA-256 of a file, by which a later --overwrite knows it."""
+    content = file.read_bytes()
+    return [len(content), hashlib.sha256(content).hexdigest()]
+
+
+# The source
+
+
+def _identity(file: Path) -> tuple[int, ...] | None:
+    """What changes when a file is changed or replaced; None if it is not there."""
+    try:
+        status = file.stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns, status.st_ino
+
+
+def _check_unchanged(before: dict[Path, tuple[int, ...] | None]) -> None:
+    for file, identity in before.items():
+        if _identity(file) != identity:
+            raise SceneError(f"{file}: changed or vanished while the scene was made of it; nothing was written")
+
+
+# The process that works
+
+
+def _in_child(source: Path, scene: Path, order: dict[str, Json], observe: Observer) -> dict[str, Any]:
+    """Let a process of its own do the work; return its report, or raise its error."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    # A session of its own: Ctrl-C in a terminal reaches this process alone, which then ends the other one.
+    with subprocess.Popen(CHILD, **pipes, env=environment, start_new_session=True) as child:
+        assert child.stdin is not None and child.stdout is not None and child.stderr is not None
+        last: deque[bytes] = deque(maxlen=LAST_LINES)
+        listener = Thread(target=last.extend, args=(child.stderr,), daemon=True)
+        listener.start()
+        answer: dict[str, Any] = {}
+        try:
+            with suppress(BrokenPipeError):
+                child.stdin.write(json.dumps(order).encode() + b"\n")
+                child.stdin.flush()
+            for line in child.stdout:
+                answer = json.loads(line)
+                if "stage" in answer:
+                    observe(*answer["stage"])
+        except BaseException:
+            child.kill()
+            raise
+        child.wait()
+        listener.join()
+    if "report" in answer:
+        report: dict[str, Any] = answer["report"]
+        return report
+    if "error" in answer:
+        kind, text, number = answer["error"], answer["text"], answer["number"]
+    else:
+        kind, text, number = (
+            "SceneError",
+            _end_of(source, child.returncode, b"".join(last).decode(errors="replace")),
+            None,
+        )
+    if PYCOLMAP in text:  # it seldom tells why
+        number = errno.ENOSPC if FULL.search(text) else _write_fault(Path(str(order["folder"])))
+    if number in FULL_ERRORS:
+        raise StorageError.at(scene, OSError(number, os.strerror(number)))
+    if number is not None:
+        raise OSError(text)
+    if kind in RAISED:
+        raise getattr(errors, kind)(text)
+    raise (ValueError if kind == "ValueError" else RuntimeError)(text)
+
+
+def _write_fault(folder: Path) -> int | None:
+    """Return the number of the error of writing a file of 1 MiB; None if that works."""
+    try:
+        (folder / "probe").write_bytes(bytes(PROBE))
+    except OSError as error:
+        return error.errno
+    return None
+
+
+def _end_of(source: Path, code: int, words: str) -> str:
+    """Describe the end of a process that gave no answer, by its exit code and what it wrote to stderr."""
+    lines = [line for line in words.splitlines() if line.strip()]
+    reason = next((line for line in lines if REASON.search(line)), lines[-1] if lines else "no reason given")
+    end = f"signal {Signals(-code).name}" if code < 0 else f"exit code {code}"
+    hint = "; it may have had too little memory" if code == -KILLED else ""
+    return f"{source}: {PYCOLMAP}: its process ended with {end} ({one_line(reason)}){hint}"
+
+
+# The scene
+
+
+def _check_target(source: Path, scene: Path, overwrite: bool) -> None:
+    """Raise FileExistsError or ValueError if `scene` may not be written, before any work."""
+    here, target = source.resolve(), scene.resolve()
+    if here.is_relative_to(target) or target.is_relative_to(here):
+        raise ValueError(f"{scene}: expected a scene folder apart from the photos in {source}")
+    if not os.path.lexists(scene) or (scene.is_dir() and not any(scene.iterdir())):
+        return
+    if not overwrite:
+        raise FileExistsError(f"{scene}: expected a new folder, but it exists; give --overwrite or another one")
+    _check_ours(scene, scene)
+
+
+def _check_ours(folder: Path, scene: Path) -> None:
+    """Raise FileExistsError unless a folder has a scene's parts, and in them only files as nexwarp wrote them."""
+    report = folder / REPORT_FILE
+    if report.is_symlink() or not report.is_file():
+        raise FileExistsError(
+            f"{scene}: expected a scene of nexwarp to overwrite, but it holds no {REPORT_FILE}; not touching it"
+        )
+    try:
+        listed = read_object(report).get("files")
+    except READ_ERRORS:
+        listed = None
+    if not isinstance(listed, dict):
+        raise FileExistsError(
+            f"{scene}: expected a scene of nexwarp to overwrite, but its {REPORT_FILE} does not list the files; "
+            "delete the scene yourself, or give another one"
+        )
+    for part in PARTS[:2]:
+        for where, folders, files in os.walk(folder / part):
+            for path in (Path(where), *(Path(where, name) for name in (*folders, *files))):
+                name = path.relative_to(folder).as_posix()
+                ours = path.is_dir() or (path.is_file() and listed.get(name) == file_facts(path))
+                if path.is_symlink() or not ours:
+                    raise FileExistsError(
+                        f"{scene / name}: expected only files as nexwarp wrote them to overwrite, but this one is not; "
+                        "move it away, or give another scene"
+                    )
+
+
+@contextmanager
+def _claimed(scene: Path) -> Iterator[Path]:
+    """Yield a new folder beside `scene`, while no other process can have one for the same scene."""
+    claim = scene.absolute().with_name(f".{scene.name[:MAX_STEM]}-{crc32(os.fsencode(scene.name)):08x}.making")
+    if claim.is_symlink() or (claim.exists() and not (claim / LOCK_FILE).is_file()):
+        raise FileExistsError(f"{claim}: expected no such folder, where {scene} is to be made")
+    lock = FileLock(claim / LOCK_FILE, timeout=0, fallback_to_soft=False)
+    created: list[Path] = []
+    try:
+        created = make_folders(claim)
+        lock.acquire()
+    except Timeout:
+        raise FileExistsError(f"{scene}: another process is making this scene; wait until it ends") from None
+    except OSError as error:
+        if claim not in created or error.errno not in WITHOUT_LOCKS:
+            with suppress(OSError):
+                (claim / LOCK_FILE).unlink()
+            remove_empty(created)
+            raise StorageError.at(scene, error) from error
+    try:
+        for left in claim.iterdir():  # by a process that was killed
+            if left.is_dir() and (left / REPLACED).is_dir():
+                raise FileExistsError(
+                    f"{left / REPLACED}: holds {scene} as it was before a --overwrite that was killed; "
+                    f"move its files back, or delete {claim}"
+                )
+            if left.is_dir():
+                shutil.rmtree(left)
+        yield Path(tempfile.mkdtemp(dir=claim))
+    finally:
+        for left in claim.iterdir():
+            if left.is_dir() and not (left / REPLACED).is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+        with suppress(OSError):
+            (claim / LOCK_FILE).unlink()
+        lock.release()
+        remove_empty([claim, *created])
+
+
+def _publish(made: Path, scene: Path, aside: Path | None) -> None:
+    """Rename `made` to `scene`; with `aside`, replace its parts, which are moved there, checked, and deleted.
+
+    FileExistsError: there is a `scene` now that may not be replaced; it stays as it is.
+    """
+    if aside is None or not scene.exists() or not any(scene.iterdir()):
+        try:
+            if os.name == "nt" and scene.exists():  # elsewhere an empty folder can be replaced
+                scene.rmdir()
+            made.rename(scene)
+        except OSError as error:
+            if not os.path.lexists(scene):
+                raise StorageError.at(scene, error) from error
+            raise FileExistsError(f"{scene}: appeared while the scene was made; not touching it") from None
+        return
+    aside.mkdir()
+    moved: list[tuple[Path, Path]] = []  # from, to
+    try:
+        for part in PARTS:
+            if os.path.lexists(scene / part):
+                _move(scene / part, aside / part, moved)
+        _check_ours(aside, scene)
+        for part in PARTS:
+            if os.path.lexists(scene / part):
+                raise FileExistsError(f"{scene / part}: appeared while the scene was made; not touching it")
+            _move(made / part, scene / part, moved)
+    except BaseException:
+        try:
+            for origin, place in reversed(moved):
+                place.rename(origin)
+            aside.rmdir()
+        except OSError as error:
+            raise OSError(f"{scene}: cannot be put back ({error}); its files are in {aside}") from error
+        raise
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def _move(origin: Path, place: Path, moved: list[tuple[Path, Path]]) -> None:
+    origin.rename(place)
+    moved.append((origin, place))

@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+from nexwarp.data.sfm.frames import FrameChoice
 from nexwarp.data.sfm.pairs import components
 
 FEW_FEATURES = 500  # a photo
@@ -67,6 +69,9 @@ class SfmReport:
         matching: "exhaustive" or "sequential".
         seconds: wall-clock time of each stage.
         advice: how to get more photos registered; empty if 90 % or more are registered.
+        blurred: names of photos that are much less sharp than the others; they are used all the same.
+        repeated: names of photos that show nearly the same as the one before; they are used all the same.
+        frames: the frames of a video; None for photos.
     """
 
     photos: int
@@ -83,10 +88,24 @@ class SfmReport:
     matching: str
     seconds: dict[str, float]
     advice: list[str]
+    blurred: list[str]
+    repeated: list[str]
+    frames: FrameChoice | None = None
+
+    @classmethod
+    def of(cls, data: dict[str, Any]) -> "SfmReport":
+        """Return the report of what JSON holds of it."""
+        nested = {
+            "cameras": [EstimatedCamera(**camera) for camera in data["cameras"]],
+            "sizes": [tuple(size) for size in data["sizes"]],
+            "frames": data["frames"] and FrameChoice(**data["frames"]),
+        }
+        return cls(**(data | nested))
 
     def rows(self) -> dict[str, str]:
         """The figures as rows of a table: name -> text."""
-        rows = {
+        rows = {} if self.frames is None else self.frames.rows()
+        rows |= {
             "registered": f"{len(self.registered)} of {self.photos} photos",
             "points": f"{self.points:,}",
             "mean track length": f"{self.mean_track_length:.2f} photos",
@@ -107,9 +126,11 @@ class SfmReport:
         return rows
 
     def lines(self) -> list[str]:
-        """The photos that were left out and the advice, one line each."""
+        """What is suspicious, the photos that were left out, and the advice, one line each."""
+        lines = [f"blurred: {name}; kept" for name in self.blurred]
+        lines += [f"repeats the photo before: {name}; kept" for name in self.repeated]
         names = list(self.left_out)
-        lines = [f"left out: {name}: {self.left_out[name]}" for name in names[:LISTED]]
+        lines += [f"left out: {name}: {self.left_out[name]}" for name in names[:LISTED]]
         if len(names) > LISTED:
             lines.append(f"left out: {len(names) - LISTED} more, all named in sfm.json")
         return lines + [f"advice: {text}" for text in self.advice]

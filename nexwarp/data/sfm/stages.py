@@ -1,110 +1,67 @@
-"""The stages of structure from motion, from photos to a scene."""
+"""The stages of structure from motion with pycolmap, from photos to a scene; they run in a process of their own."""
 
-import dataclasses
 import os
-import shutil
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, TypeVar
 
+from nexwarp.data.colmap import read_model
+from nexwarp.data.images import read_image
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.sfm.options import EXHAUSTIVE_UP_TO, SfmOptions
 from nexwarp.data.sfm.pairs import exhaustive_pairs, sequential_pairs
-from nexwarp.data.sfm.photos import InputPhoto, camera_groups, camera_model, list_photos, read_photos
+from nexwarp.data.sfm.photos import InputPhoto, affordable_threads, camera_groups, camera_model, judged, read_photos
 from nexwarp.data.sfm.report import EstimatedCamera, Overlaps, SfmReport, advise, left_out
-from nexwarp.data.sfm.work import Count, open_database, quiet, run_stage
-from nexwarp.io.files import make_folders, remove_empty
-from nexwarp.io.json_files import Json, write_json
+from nexwarp.io.files import one_line
 
 if TYPE_CHECKING:
     import pycolmap
 
-REPORT_FILE = "sfm.json"
 JPEG_QUALITY = 95  # of undistorted JPEG photos; other formats are lossless
-MATCH_BLOCK = 16  # pairs between two checks for an interruption
+MATCH_BLOCK = 16  # pairs that are matched together
 MIN_MODEL = 3  # photos of a model
+POLL_SECONDS = 0.2
+ONLY_FATAL = 3  # glog level
+PYCOLMAP = "pycolmap failed"  # in messages
+# Exceptions of pycolmap 4.2; failed checks raise ValueError or RuntimeError.
+ERRORS = (RuntimeError, ValueError, IndexError, KeyError, OSError, MemoryError)
 
+T = TypeVar("T")
 Observer = Callable[[str, int, int], None]
 
 
-def reconstruct(
-    photos: str | os.PathLike[str],
-    scene: str | os.PathLike[str],
-    options: SfmOptions | None = None,
-    *,
-    overwrite: bool = False,
-    observe: Observer = lambda stage, done, total: None,
-    notes: Mapping[str, Json] | None = None,
-) -> SfmReport:
-    """Estimate the cameras and points of photos, and write a COLMAP scene for `load_scene`.
-
-    The scene holds images/ (undistorted, with the given names), sparse/0 (PINHOLE cameras) and sfm.json (the report and
-    the options). It is written to a temporary folder beside `scene` and renamed at the end; a failure or interruption
-    leaves no files.
-
-    Args:
-        photos: folder of the photos, searched with its subfolders; hidden files are ignored.
-        scene: folder to write; must be empty or absent.
-        options: settings; None is the defaults.
-        overwrite: replace `scene` if this function wrote it.
-        observe: called repeatedly with the stage's name, the number of finished items and their total.
-        notes: further entries of sfm.json.
-
-    Returns:
-        The report.
-
-    Raises:
-        FileNotFoundError: no folder `photos`.
-        FileExistsError: `scene` exists and may not be replaced.
-        ValueError: an option out of range, fewer than 3 photos, a photo that cannot be decoded, photos of one camera
-            that differ in size, or no model was found; then the message gives advice.
-    """
-    photos, scene, options = Path(photos), Path(scene), options or SfmOptions()
-    options.check()
-    names = list_photos(photos)
-    check_target(photos, scene, overwrite)
-    with (
-        parents(scene),
-        tempfile.TemporaryDirectory(
-            dir=scene.parent, prefix=f".{scene.name}-", ignore_cleanup_errors=True
-        ) as temporary,
-        quiet(),
-    ):
-        work = _Work(photos, Path(temporary), options, observe)
-        report = work.run(names)
-        made = work.folder / "scene"
-        entries = dataclasses.asdict(report) | {"options": dataclasses.asdict(options)}
-        write_json(made / REPORT_FILE, entries | dict(notes or {}))
-        _publish(made, scene, work.folder / "replaced")
-    return report
-
-
 @dataclass
-class _Work:
-    """The stages; they share COLMAP's database in a temporary folder."""
+class Stages:
+    """The stages; they share COLMAP's database in a folder of their own, and leave the scene in its subfolder."""
 
     photos: Path
     folder: Path
     options: SfmOptions
     observe: Observer
     seconds: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def database(self) -> Path:
-        return self.folder / "database.db"
+    decoders: int = 1  # threads that may each hold a photo
 
     @property
     def threads(self) -> int:
+        """Threads in pycolmap's notation: -1 is one a core."""
         return self.options.threads or -1
 
+    @property
+    def database(self) -> Path:
+        """COLMAP's database."""
+        return self.folder / "database.db"
+
     def run(self, names: Sequence[str]) -> SfmReport:
+        """Reconstruct the photos of these names, and return the report."""
+        pycolmap_module().logging.minloglevel = ONLY_FATAL
+        self.decoders = affordable_threads(self.photos, names, self.options)
         with self._stage("reading", len(names)) as done:
-            photos = read_photos(self.photos, names, done)
+            photos = read_photos(self.photos, names, self.decoders, done)
             groups = camera_groups(self.photos, photos, self.options.cameras)
         with self._stage("features", len(names)) as done:
             self._import(groups)
@@ -122,6 +79,9 @@ class _Work:
         registered = _names(models[0])
         with self._stage("undistorting", len(registered)) as done:
             sizes = self._undistort(models[0], done)
+        with self._stage("checking", len(registered)) as done:
+            self._check(done)
+        blurred, repeated = judged(photos)
         return SfmReport(
             photos=len(names),
             registered=[name for name in names if name in set(registered)],
@@ -137,6 +97,8 @@ class _Work:
             matching="sequential" if sequential else "exhaustive",
             seconds={stage: round(value, 2) for stage, value in self.seconds.items()},
             advice=advise(overlaps, len(registered)),
+            blurred=blurred,
+            repeated=repeated,
         )
 
     @contextmanager
@@ -171,14 +133,13 @@ class _Work:
         single = pycolmap.CameraMode.SINGLE
         run_stage(
             "features",
-            lambda _: pycolmap.import_images(self.database, self.photos, single, names, reader),
-            lambda: None,
+            lambda: pycolmap.import_images(self.database, self.photos, single, names, reader),
         )
 
     def _extract(self, names: Sequence[str], done: Callable[[int], None]) -> None:
         pycolmap = pycolmap_module()
         extraction = pycolmap.FeatureExtractionOptions()
-        extraction.num_threads = self.threads
+        extraction.num_threads = self.decoders
         extraction.max_image_size = self.options.max_image_size
         extraction.sift.max_num_features = self.options.max_features
         with open_database(self.database) as database:
@@ -186,13 +147,12 @@ class _Work:
             count = Count((images[name] for name in names), database.exists_descriptors)
             run_stage(
                 "features",
-                lambda token: pycolmap.extract_features(
+                lambda: pycolmap.extract_features(
                     self.database,
                     self.photos,
                     list(names),
                     extraction_options=extraction,
                     device=pycolmap.Device.cpu,
-                    cancellation_token=token,
                 ),
                 lambda: done(count()),
             )
@@ -215,8 +175,8 @@ class _Work:
             )
             run_stage(
                 "matching",
-                lambda token: pycolmap.match_image_pairs(
-                    self.database, matching, pairing, verification, device=pycolmap.Device.cpu, cancellation_token=token
+                lambda: pycolmap.match_image_pairs(
+                    self.database, matching, pairing, verification, device=pycolmap.Device.cpu
                 ),
                 lambda: done(count()),
             )
@@ -260,14 +220,13 @@ class _Work:
         (self.folder / "models").mkdir()
         made = run_stage(
             "mapping",
-            lambda token: pycolmap.incremental_mapping(
+            lambda: pycolmap.incremental_mapping(
                 self.database,
                 self.photos,
                 self.folder / "models",
                 options,
                 initial_image_pair_callback=first_pair,
                 next_image_callback=next_photo,
-                cancellation_token=token,
             ),
             lambda: done(registered),
         )
@@ -289,13 +248,12 @@ class _Work:
         model.write_binary(str(chosen))
         run_stage(
             "undistorting",
-            lambda token: pycolmap.undistort_images(
+            lambda: pycolmap.undistort_images(
                 output,
                 chosen,
                 self.photos,
                 jpeg_quality=JPEG_QUALITY,
-                num_threads=self.threads,
-                cancellation_token=token,
+                num_threads=self.decoders,
             ),
             lambda: done(sum(len(files) for _, _, files in os.walk(output / "images"))),
         )
@@ -305,6 +263,17 @@ class _Work:
         (output / "sparse").rename(scene / "sparse" / "0")
         cameras = pycolmap.Reconstruction(str(scene / "sparse" / "0")).cameras.values()
         return sorted({(camera.width, camera.height) for camera in cameras})
+
+    def _check(self, done: Callable[[int], None]) -> None:
+        """Read what was written: pycolmap tells no fault of the disk."""
+        images = self.folder / "scene" / "images"
+        photos = read_model(self.folder / "scene", images).photos
+        with ThreadPoolExecutor(self.decoders) as pool:
+            shapes = pool.map(lambda photo: tuple(read_image(images / photo.name).shape[:2]), photos)
+            for count, (photo, shape) in enumerate(zip(photos, shapes, strict=True), start=1):
+                if shape != (photo.lens.height, photo.lens.width):
+                    raise ValueError(f"{photo.name}: {PYCOLMAP}: it wrote {shape[1]}x{shape[0]} pixels")
+                done(count)
 
 
 def _names(model: "pycolmap.Reconstruction") -> list[str]:
@@ -329,41 +298,42 @@ def _cameras(model: "pycolmap.Reconstruction", photos: dict[str, InputPhoto]) ->
     ]
 
 
-def check_target(photos: Path, scene: Path, overwrite: bool) -> None:
-    """Raise FileExistsError or ValueError if `scene` may not be written, before any work."""
-    source, target = photos.resolve(), scene.resolve()
-    if source.is_relative_to(target) or target.is_relative_to(source):
-        raise ValueError(f"{scene}: expected a scene folder apart from the photos in {photos}")
-    if not scene.exists() or (scene.is_dir() and not any(scene.iterdir())):
-        return
-    if not overwrite:
-        raise FileExistsError(f"{scene}: expected a new folder, but it exists; give --overwrite or another one")
-    if not (scene / REPORT_FILE).is_file():
-        raise FileExistsError(
-            f"{scene}: expected a scene of nexwarp sfm to overwrite, but it holds no {REPORT_FILE}; not touching it"
-        )
+def run_stage(title: str, work: Callable[[], T], watch: Callable[[], None] = lambda: None) -> T:
+    """Return the result of `work`, done in a thread, while this one calls `watch` every 0.2 s and at the end.
+
+    ValueError: pycolmap failed; the message names the stage.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        future = pool.submit(work)
+        while wait([future], POLL_SECONDS).not_done:
+            watch()
+    try:
+        result = future.result()
+    except ERRORS as error:
+        raise ValueError(f"{title}: {PYCOLMAP}: {one_line(error) or type(error).__name__}") from error
+    watch()
+    return result
 
 
 @contextmanager
-def parents(scene: Path) -> Iterator[None]:
-    """Create the folders above `scene`; after an error, remove those of them that are empty."""
-    created = make_folders(scene.absolute().parent)
-    try:
-        yield
-    except BaseException:
-        remove_empty(created)
-        raise
+def open_database(path: Path) -> Iterator["pycolmap.Database"]:
+    """Open COLMAP's database through pycolmap, and close it at the end of the block.
+
+    Python's sqlite3 must not open it: it is a second copy of SQLite in the process, and closing its file releases the
+    locks of the first copy, after which pycolmap crashes with a bus error.
+    """
+    with closing(pycolmap_module().Database.open(str(path))) as database:
+        yield database
 
 
-def _publish(made: Path, scene: Path, aside: Path) -> None:
-    """Rename `made` to `scene`. An existing scene is moved to `aside`, and moved back if that fails."""
-    if not scene.exists():
-        made.rename(scene)
-        return
-    scene.rename(aside)
-    try:
-        made.rename(scene)
-    except BaseException:
-        shutil.rmtree(scene, ignore_errors=True)
-        aside.rename(scene)
-        raise
+class Count(Generic[T]):
+    """Counts finished items that finish roughly in order; each call checks only the first unfinished ones."""
+
+    def __init__(self, items: Iterable[T], is_done: Callable[[T], bool]) -> None:
+        self.items, self.is_done, self.done = list(items), is_done, 0
+
+    def __call__(self) -> int:
+        """Number of finished items before the first unfinished one."""
+        while self.done < len(self.items) and self.is_done(self.items[self.done]):
+            self.done += 1
+        return self.done
