@@ -27,7 +27,7 @@ from torch import nn
 from benchmarks.timing import git_commit, synchronize
 from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.run.evaluate import evaluate
-from nexwarp.train.densify import split_surfels
+from nexwarp.train.densify import DensityControl, split_surfels
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.ranks.launch import launch
 from nexwarp.train.ranks.ranks import GradientReducer, Ranks
@@ -146,8 +146,11 @@ def timed(options: Scaling, scene: Scene, mode: str, ranks: Ranks) -> dict[str, 
     config: Config = trainer.config
     while (count := len(trainer.surfels)) < options.surfels:
         chosen = torch.arange(min(count, options.surfels - count), device=ranks.device)
-        split_surfels(trainer.surfels, trainer.optimizer, chosen)
-    trainer.densifier.errors = torch.zeros_like(trainer.surfels.logit_opacities.detach())
+        rows = torch.cat([torch.arange(count, device=ranks.device), chosen])
+        sides = torch.zeros_like(rows)
+        sides[chosen], sides[count:] = -1, 1
+        split_surfels(trainer.surfels, trainer.optimizer, rows, sides)
+    trainer.densifier = DensityControl(trainer.surfels, config)
     trainer.iteration = round(LATE / 30_000 * config.iterations)
     # First steps are slower: graphs are captured, and a rank prepares each view when it first renders it.
     for _ in range(VISITS * len(scene.train)):

@@ -44,6 +44,7 @@ from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops import tape as tape
 from nexwarp.train.api import train
+from nexwarp.train.densify import DensityControl
 from nexwarp.train.recipe import Config, preset
 from nexwarp.train.report import StepReport
 from nexwarp.train.target import Target
@@ -52,6 +53,7 @@ from nexwarp.train.trainer import Trainer
 __all__ = [
     "Camera",
     "Config",
+    "DensityControl",
     "DetailLimits",
     "Exposures",
     "Hits",

@@ -4,27 +4,42 @@ Once the budget is used up, the paper's density control splits a surfel only whe
 Relocation, which the paper does not have, therefore removes the surfels that the training views need least.
 """
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from torch import nn
 
 from nexwarp.cameras.camera import Camera, reduced
+from nexwarp.errors import check_tensors
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import PARAMETERS, Surfels
-from nexwarp.train.recipe import DensifyConfig
+from nexwarp.train.recipe import Config
 
 RELOCATE_EVERY = 10  # rounds: the new surfels have to settle
 RELOCATE_UNTIL = 0.6  # share of the densification's iterations
 FULL = 0.98  # share of the budget from which it counts as used up: a round that splits few leaves some of it
+SHORTEST_ROUND = 10  # iterations between rounds of a short run, unless the settings have fewer
 
 
-class Densifier:
-    """Sums of each surfel's blended error since the last split, and the rounds that use them up."""
+class DensityControl:
+    """Splits and prunes the surfels of a training, `nexwarp.train`'s or a loop of your own.
 
-    def __init__(self, config: DensifyConfig, surfels: Surfels, max_surfels: int) -> None:
-        self.config = config
-        self.max_surfels = max_surfels
+    `accumulate` adds the errors of each step; where a round is `due`, `step` uses them up. It replaces the parameters
+    of the surfels, in the optimizer too, and moves the rows of the optimizer's state.
+
+    Attributes:
+        config: the schedule, `Config.densify` stretched to the iterations of the run.
+        errors: (N,) each surfel's blended error since the last split.
+    """
+
+    def __init__(self, surfels: Surfels, config: Config) -> None:
+        """Watch surfels, by the settings `densify`, `iterations` and `max_surfels` of a config."""
+        stretched = {name: config.scaled(getattr(config.densify, name)) for name in ("start", "stop", "every")}
+        stretched["every"] = max(stretched["every"], min(config.densify.every, SHORTEST_ROUND))
+        self.config = dataclasses.replace(config.densify, **stretched)
+        self.max_surfels = config.max_surfels
+        self.surfels = surfels
         self.errors = torch.zeros_like(surfels.logit_opacities.detach())
 
     def active(self, iteration: int) -> bool:
@@ -36,169 +51,152 @@ class Densifier:
         c, late = self.config, iteration % self.config.every
         return c.start < iteration - late < c.stop and late < views
 
-    def relocates(self, iteration: int, count: int) -> bool:
-        """Whether a round after this iteration, with so many surfels, also prunes those that are needed least."""
+    def relocates(self, iteration: int) -> bool:
+        """Whether the round after this iteration also prunes the surfels that are needed least."""
         c = self.config
         rare = iteration // c.every % RELOCATE_EVERY == 0
-        return c.relocate > 0 and rare and iteration < RELOCATE_UNTIL * c.stop and count >= FULL * self.max_surfels
-
-    def unneeded(
-        self,
-        model: Model,
-        cameras: Sequence[Camera],
-        largest: Callable[[torch.Tensor], torch.Tensor] = lambda values: values,
-    ) -> torch.Tensor:
-        """Return the surfels (N,) bool to relocate; see `least_contributing`."""
-        return least_contributing(model, cameras, self.config.relocate, largest)
+        full = len(self.surfels) >= FULL * self.max_surfels
+        return c.relocate > 0 and rare and iteration < RELOCATE_UNTIL * c.stop and full
 
     def accumulate(self, errors: torch.Tensor) -> None:
-        """Add the blended errors (N,) of one view."""
+        """Add the blended errors (N,) >= 0 of one view, such as `Rendering.splat_error` returns them."""
+        check_tensors({"errors": (errors, tuple(self.errors.shape))}, device=self.errors.device)
         self.errors += errors
 
+    @torch.no_grad()
     def step(
         self,
-        surfels: Surfels,
         optimizer: torch.optim.Optimizer,
-        generator: torch.Generator,
+        generator: torch.Generator | None = None,
         unneeded: torch.Tensor | None = None,
-    ) -> tuple[int, int]:
-        """Split and prune, in place, `unneeded` (N,) bool surfels too; return how many were split and how many pruned.
+        along: Iterable[tuple[nn.Module, str]] = (),
+    ) -> torch.Tensor:
+        """Split and prune the surfels, which keep their order as far as the budget has room for all.
 
-        Children start with optimizer state of zeros. Where the budget is within reach of a round that prunes, second
-        children take the rows of pruned surfels. A round at the budget then changes no tensor's size or address, and
-        CUDA graphs of training steps stay valid.
+        Children start with optimizer state of zeros; state of other shapes than its parameter's stays as it is. Where
+        the number of surfels does not change, no tensor changes its address, and CUDA graphs of steps stay valid.
+
+        Args:
+            optimizer: any torch optimizer; parameters that it does not have are replaced all the same.
+            generator: draws the surfels to split, on the CPU; None is torch's own.
+            unneeded: (N,) bool, surfels to remove besides the transparent ones.
+            along: modules and the names of their parameters or buffers that have a row for each surfel, to be treated
+                as the surfels' own. Children take their parent's row.
+
+        Returns:
+            (M,) int64, for each of the M surfels the row that it, or its parent, had before. `x = x[rows]` takes along
+            any tensor with a row for each surfel.
         """
-        count, prunes = len(surfels), self.config.prune_at_cap
+        rows, sides, split = self._plan(generator, unneeded)
+        if split:
+            self.errors.zero_()
+        if len(rows) != len(self.errors):
+            self.errors = self.errors[rows]
+        if split or len(rows) != len(self.surfels):
+            split_surfels(self.surfels, optimizer, rows, sides)
+            for module, name in along:
+                _take_rows(module, name, optimizer, rows, sides)
+        return rows
+
+    def _plan(
+        self, generator: torch.Generator | None, unneeded: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor, bool]:
+        """Return the rows (M,) that stay or are split, sides (M,) of children, else 0, and whether any is split."""
+        opacities, count = self.surfels.opacities.detach(), len(self.surfels)
+        gone = torch.zeros_like(opacities, dtype=torch.bool) if unneeded is None else unneeded
+        prunes = self.config.prune_at_cap
+        transparent = opacities < self.config.prune_opacity
+        spared = opacities == opacities.max()  # without the most opaque ones no gradient would be left
         if prunes and int((1 + self.config.fraction) * count) >= self.max_surfels:
-            return self._replace(surfels, optimizer, generator, unneeded)
-        pruned = 0 if unneeded is None else self.remove(surfels, optimizer, unneeded)
-        count = len(surfels)
-        room = min(self.max_surfels, int((1 + self.config.fraction) * count)) - count
-        chosen = self._choose(room, generator)
-        if len(chosen):
-            split_surfels(surfels, optimizer, chosen)
-            self.errors = torch.zeros_like(surfels.logit_opacities.detach())
+            return self._exchange(gone & ~spared, (gone | transparent) & ~spared, generator)
+        rows = (~gone | spared).nonzero()[:, 0]
+        room = min(self.max_surfels, int((1 + self.config.fraction) * len(rows))) - len(rows)
+        chosen = self._choose(self.errors[rows], room, generator)
+        sides = torch.zeros_like(rows)
+        sides[chosen] = -1
+        rows, sides = torch.cat([rows, rows[chosen]]), torch.cat([sides, torch.ones_like(chosen)])
         if len(chosen) or prunes:
-            pruned += self.remove(surfels, optimizer, self._transparent(surfels))
-        return len(chosen), pruned
+            kept = ~transparent[rows] | spared[rows]
+            rows, sides = rows[kept], sides[kept]
+        return rows, sides, len(chosen) > 0
 
-    def _replace(
-        self,
-        surfels: Surfels,
-        optimizer: torch.optim.Optimizer,
-        generator: torch.Generator,
-        unneeded: torch.Tensor | None,
-    ) -> tuple[int, int]:
-        """Prune and split in one go, `fraction` of the surfels and one for each unneeded; children take pruned rows."""
-        if unneeded is None:
-            unneeded = torch.zeros_like(surfels.logit_opacities, dtype=torch.bool)
-        spared = _most_opaque(surfels)
-        gone = (self._transparent(surfels) | unneeded) & ~spared
-        rows, count = gone.nonzero()[:, 0], len(surfels)
-        self.errors[rows] = 0
-        most = int(self.config.fraction * count) + int((unneeded & ~spared).sum())
-        chosen = self._choose(min(self.max_surfels - count + len(rows), most), generator)
-        if len(chosen):
-            appended = torch.arange(count, count + len(chosen), device=rows.device)
-            split_surfels(surfels, optimizer, chosen, torch.cat([rows, appended])[: len(chosen)])
-            if len(surfels) == count:
-                self.errors.zero_()
-            else:
-                self.errors = torch.zeros_like(surfels.logit_opacities.detach())
-        if len(chosen) < len(rows):
-            left = torch.zeros(len(surfels), dtype=torch.bool, device=rows.device)
-            left[rows[len(chosen) :]] = True
-            self.remove(surfels, optimizer, left)
-        return len(chosen), len(rows)
+    def _exchange(
+        self, unneeded: torch.Tensor, gone: torch.Tensor, generator: torch.Generator | None
+    ) -> tuple[torch.Tensor, torch.Tensor, bool]:
+        """As `_plan` within reach of the budget: `fraction` is split, and one for each unneeded, into pruned rows."""
+        pruned, count = gone.nonzero()[:, 0], len(gone)
+        self.errors[pruned] = 0
+        most = int(self.config.fraction * count) + int(unneeded.sum())
+        chosen = self._choose(self.errors, min(self.max_surfels - count + len(pruned), most), generator)
+        places = torch.cat([pruned, torch.arange(count, count + len(chosen), device=gone.device)])[: len(chosen)]
+        rows = torch.arange(max(count, count + len(chosen) - len(pruned)), device=gone.device)
+        sides = torch.zeros_like(rows)
+        rows[places] = chosen
+        sides[places], sides[chosen] = 1, -1
+        kept = torch.ones_like(rows, dtype=torch.bool)
+        kept[pruned[len(chosen) :]] = False
+        return rows[kept], sides[kept], len(chosen) > 0
 
-    def _transparent(self, surfels: Surfels) -> torch.Tensor:
-        return surfels.opacities.detach() < self.config.prune_opacity
-
-    def remove(self, surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: torch.Tensor) -> int:
-        """Remove the chosen (N,) bool surfels but for the most opaque ones, without which no gradient would be left."""
-        keep = ~chosen | _most_opaque(surfels)
-        removed = int((~keep).sum())
-        if removed:
-            kept = keep.nonzero()[:, 0]
-            replace_rows(surfels, optimizer, kept)
-            self.errors = self.errors[kept]
-        return removed
-
-    def _choose(self, count: int, generator: torch.Generator) -> torch.Tensor:
-        """Draw surfels without replacement, with probability proportional to their blended error."""
-        errors = torch.nan_to_num(self.errors.double().cpu(), 0.0, 0.0, 0.0).clamp_min(0)
+    def _choose(self, errors: torch.Tensor, count: int, generator: torch.Generator | None) -> torch.Tensor:
+        """Draw rows of errors without replacement, with probability proportional to them."""
+        device = errors.device
+        errors = torch.nan_to_num(errors.double().cpu(), 0.0, 0.0, 0.0).clamp_min(0)
         candidates = int((errors > 0).sum())
         if candidates == 0 or count <= 0:
-            return torch.empty(0, dtype=torch.long, device=self.errors.device)
+            return torch.empty(0, dtype=torch.long, device=device)
         # Keys u^(1/p) are those of weighted sampling without replacement; -log keeps them exact (Efraimidis, Spirakis).
         keys = torch.empty_like(errors).exponential_(generator=generator) / errors
-        chosen = keys.topk(min(count, candidates), largest=False).indices.sort().values
-        return chosen.to(self.errors.device)
-
-
-def _most_opaque(surfels: Surfels) -> torch.Tensor:
-    opacities = surfels.opacities.detach()
-    return opacities == opacities.max()
+        return keys.topk(min(count, candidates), largest=False).indices.sort().values.to(device)
 
 
 @torch.no_grad()
-def split_surfels(
-    surfels: Surfels, optimizer: torch.optim.Optimizer, chosen: torch.Tensor, places: torch.Tensor | None = None
-) -> None:
-    """Replace each chosen surfel by two halves along its longer axis: scale / 2, centres at +-scale / 2.
+def split_surfels(surfels: Surfels, optimizer: torch.optim.Optimizer, rows: torch.Tensor, sides: torch.Tensor) -> None:
+    """Make the surfels the given rows (M,) of themselves, and halves of these where sides (M,) are -1 or 1, not 0.
 
-    The first child takes the parent's row `chosen` (M,). The second takes that in `places` (M,): rows that are no
-    parent's, then N, N + 1 and so on for those to append; None appends all. The optimizer's state is zero for children.
+    Halves lie along the longer axis: scale / 2, centres at -+ scale / 2.
     """
-    count = len(surfels)
-    if places is None:
-        places = torch.arange(count, count + len(chosen), device=chosen.device)
-    quats, log_scales = surfels.quats[chosen], surfels.log_scales[chosen]
-    axis = log_scales.argmax(dim=1)
-    rows = torch.arange(len(chosen), device=chosen.device)
-    w, x, y, z = quats.unbind(-1)
+    for name in PARAMETERS:
+        _take_rows(surfels, name, optimizer, rows, sides)
+    children = sides.nonzero()[:, 0]
+    log_scales, means = surfels.log_scales[children], surfels.means[children]
+    axis, at = log_scales.argmax(dim=1), torch.arange(len(children), device=children.device)
+    w, x, y, z = surfels.quats[children].unbind(-1)
     # First two columns of the rotation matrix.
     x_axis = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
     y_axis = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1)
-    offset = torch.where(axis[:, None] == 0, x_axis, y_axis) * (log_scales[rows, axis].exp() / 2)[:, None]
-    halved = log_scales.clone()
-    halved[rows, axis] -= torch.log(torch.tensor(2.0)).item()
-    means = surfels.means[chosen]
-    new = int((places >= count).sum())
-    if new:
-        everyone = torch.arange(count, device=chosen.device)
-        replace_rows(surfels, optimizer, torch.cat([everyone, chosen[len(chosen) - new :]]))
-    for name in PARAMETERS:
-        parameter = getattr(surfels, name)
-        parameter[places] = parameter[chosen]
-        for value in optimizer.state.get(parameter, {}).values():
-            if has_rows_of(value, parameter):
-                value[chosen] = 0
-                value[places] = 0
-    surfels.means[chosen], surfels.means[places] = means - offset, means + offset
-    surfels.log_scales[chosen], surfels.log_scales[places] = halved, halved
+    offset = torch.where(axis[:, None] == 0, x_axis, y_axis) * (log_scales[at, axis].exp() / 2)[:, None]
+    log_scales[at, axis] -= torch.log(torch.tensor(2.0)).item()
+    surfels.means[children] = means + sides[children, None] * offset
+    surfels.log_scales[children] = log_scales
 
 
-@torch.no_grad()
-def replace_rows(surfels: Surfels, optimizer: torch.optim.Optimizer, rows: torch.Tensor) -> None:
-    """Make the surfels the given rows (M,) of themselves, and so all optimizer state of their parameters' shapes."""
-    for name in PARAMETERS:
-        old = getattr(surfels, name)
-        new = nn.Parameter(old.detach()[rows].contiguous())
-        setattr(surfels, name, new)
+def _take_rows(
+    module: nn.Module, name: str, optimizer: torch.optim.Optimizer, rows: torch.Tensor, sides: torch.Tensor
+) -> None:
+    """Replace a parameter or buffer by the given rows (M,) of it, and the optimizer's state; zero state for children.
+
+    As many rows as before are written in place.
+    """
+    path, _, leaf = name.rpartition(".")
+    owner = module.get_submodule(path)
+    old: torch.Tensor = getattr(owner, leaf)
+    state = optimizer.state.get(old, {})
+    moved = {key: x[rows] for key, x in state.items() if isinstance(x, torch.Tensor) and x.shape == old.shape}
+    for value in moved.values():
+        value[sides != 0] = 0
+    if len(rows) == len(old):
+        old.copy_(old[rows])
+        for key, value in moved.items():
+            state[key].copy_(value)
+        return
+    new = old[rows]
+    if isinstance(old, nn.Parameter):
+        new = nn.Parameter(new, old.requires_grad)
         for group in optimizer.param_groups:
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
-        state = optimizer.state.pop(old, None)
-        if state is not None:
-            for key, value in state.items():
-                if has_rows_of(value, old):
-                    state[key] = value[rows].contiguous()
-            optimizer.state[new] = state
-
-
-def has_rows_of(value: object, parameter: torch.Tensor) -> bool:
-    """Whether a value of an optimizer's state holds a number for each number of the parameter."""
-    return isinstance(value, torch.Tensor) and value.shape == parameter.shape
+        if optimizer.state.pop(old, None) is not None:
+            optimizer.state[new] = {**state, **moved}
+    setattr(owner, leaf, new)
 
 
 @torch.no_grad()

@@ -21,6 +21,7 @@ from nexwarp.model.graphs import Gradients, GraphKey, StepResult, UpdateError, c
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.checkpoint import Snapshot
+from nexwarp.train.densify import least_contributing
 from nexwarp.train.ranks.ranks import GradientReducer, Ranks
 from nexwarp.train.recipe import Config
 from nexwarp.train.target import Target
@@ -137,7 +138,7 @@ class ParallelTrainer(Trainer):
 
     def _unneeded(self) -> torch.Tensor:
         cameras = self.views.refined_cameras(self.poses)[self.ranks.rank :: self.ranks.size]
-        return self.densifier.unneeded(self.model(), cameras, self.ranks.largest)
+        return least_contributing(self.model(), cameras, self.config.densify.relocate, self.ranks.largest)
 
     def _trained(self) -> list[nn.Parameter]:
         return [x for group in self.optimizer.param_groups for x in group["params"]]

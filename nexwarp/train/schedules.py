@@ -1,6 +1,5 @@
 """Learning rates and schedules over a run, and the optimizer whose rates follow them."""
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, cast
@@ -13,7 +12,7 @@ from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops.tiles import Order
 from nexwarp.train.adam import FusedAdam, grid_factors
-from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config, DensifyConfig
+from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
 # "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where they are
@@ -123,10 +122,3 @@ def options_at(
         sh_degree=min(max(config.sh_degree, texture_degree), unlocked),
         order=cast(Order, config.order),
     )
-
-
-def densify_schedule(config: Config) -> DensifyConfig:
-    """Stretch the schedule to the run's length; rounds of short runs stay at least ten iterations apart."""
-    d = config.densify
-    every = max(config.scaled(d.every), min(d.every, 10))
-    return dataclasses.replace(d, start=config.scaled(d.start), stop=config.scaled(d.stop), every=every)

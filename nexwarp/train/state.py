@@ -21,10 +21,10 @@ from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.checkpoint import Snapshot
-from nexwarp.train.densify import Densifier
+from nexwarp.train.densify import DensityControl
 from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, texture_shape
 from nexwarp.train.recipe import Config
-from nexwarp.train.schedules import OptimizerMaker, densify_schedule, make_optimizer
+from nexwarp.train.schedules import OptimizerMaker, make_optimizer
 from nexwarp.train.settings import config_from_dict, refuse_removed
 
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
@@ -64,7 +64,7 @@ class TrainingState:
         self.cells_unit = cells_unit(scene, config)
         self.poses = initial_poses(scene, config, device)
         self.optimizer = self._make_optimizer()
-        self.densifier = Densifier(densify_schedule(config), self.surfels, config.max_surfels)
+        self.densifier = DensityControl(self.surfels, config)
         self.order: list[int] = []
         self.iteration = 0
         self.seconds = 0.0
@@ -127,7 +127,7 @@ class TrainingState:
             self.poses.load(tensors["poses.corrections"])
         self.optimizer = self._make_optimizer()
         restore_optimizer(self.optimizer, dict(self._named_parameters()), tensors, state.get("optimizer"))
-        self.densifier = Densifier(densify_schedule(self.config), self.surfels, self.config.max_surfels)
+        self.densifier = DensityControl(self.surfels, self.config)
         if tensors["densify.errors"].shape != self.densifier.errors.shape:
             raise ValueError(f"densify.errors: expected one for each of {len(self.surfels)} surfels")
         self.densifier.errors = tensors["densify.errors"].to(self.device)

@@ -16,6 +16,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.render import draw
 from nexwarp.train.checkpoint import Snapshot, load_checkpoint, save_checkpoint
+from nexwarp.train.densify import least_contributing
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.finish.finish import FinishObserver, finish_model
 from nexwarp.train.health import Health, oom_message, watched_tensors
@@ -206,12 +207,13 @@ class Trainer(TrainingState):
     def _control_density(self) -> None:
         """Split surfels of large errors, and remove those that are transparent or needed least."""
         unneeded = None
-        if self.densifier.relocates(self.iteration, len(self.surfels)):
+        if self.densifier.relocates(self.iteration):
             unneeded = beside(self.graphs, self._unneeded)
-        self.densifier.step(self.surfels, self.optimizer, self.generator, unneeded)
+        self.densifier.step(self.optimizer, self.generator, unneeded)
 
     def _unneeded(self) -> torch.Tensor:
-        return self.densifier.unneeded(self.model(), self.views.refined_cameras(self.poses))
+        cameras = self.views.refined_cameras(self.poses)
+        return least_contributing(self.model(), cameras, self.config.densify.relocate)
 
     def _graph_key(self) -> GraphKey:
         tensors = [self.densifier.errors, *(parameter for _, parameter in self._named_parameters())]

@@ -12,7 +12,7 @@ import pytest
 from nexwarp.cli import main as cli
 from nexwarp.cli.display import TrainingDisplay
 from nexwarp.train.adam import FusedAdam
-from nexwarp.train.densify import Densifier
+from nexwarp.train.densify import DensityControl
 from nexwarp.train.trainer import Trainer
 from tests.cli.support import FLAGS, RUN_FILES, read, refused, snapshot
 
@@ -39,7 +39,7 @@ def interrupt_after(
     [
         (TrainingDisplay, "__call__", 7),  # between two steps
         (TrainingDisplay, "__call__", 1),  # before there is any checkpoint
-        (Densifier, "accumulate", 5),  # after a backward pass, before the optimizer steps
+        (DensityControl, "accumulate", 5),  # after a backward pass, before the optimizer steps
         (FusedAdam, "step", 8),
     ],
 )
@@ -194,5 +194,5 @@ def test_a_second_interrupt_does_not_wait(scene, tmp_path):
         pytest.fail("not interrupted")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Densifier, "accumulate", insist)
+        patch.setattr(DensityControl, "accumulate", insist)
         assert cli.main(["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS]) == 130

@@ -5,11 +5,12 @@ from typing import Any
 
 import pytest
 import torch
+from torch import nn
 
 import nexwarp as nw
 from nexwarp.model.surfels import PARAMETERS
-from nexwarp.train.densify import Densifier, split_surfels
-from nexwarp.train.recipe import DensifyConfig
+from nexwarp.train.densify import DensityControl, split_surfels
+from nexwarp.train.recipe import Config, DensifyConfig
 from tests.reference.collect import rotations
 from tests.scenes import make_surfels, random_scene
 
@@ -55,12 +56,34 @@ def sharp_kernel(surfels: nw.Surfels, row: int, points: torch.Tensor, gamma: flo
     return torch.exp(-(u.abs() ** (2 * gamma) + v.abs() ** (2 * gamma)) / 2)
 
 
-def densifier_of(surfels: nw.Surfels, budget: int = 10_000, **changes: Any) -> Densifier:
-    return Densifier(DensifyConfig(**changes), surfels, budget)
+def densifier_of(surfels: nw.Surfels, budget: int = 10_000, **changes: Any) -> DensityControl:
+    control = DensityControl(surfels, Config(densify=DensifyConfig(**changes)))
+    control.max_surfels = budget
+    return control
+
+
+def split(surfels: nw.Surfels, optimizer: torch.optim.Optimizer, chosen: torch.Tensor) -> None:
+    """Split some surfels; second children are appended."""
+    rows = torch.cat([torch.arange(len(surfels)), chosen])
+    sides = torch.zeros_like(rows)
+    sides[chosen], sides[len(surfels) :] = -1, 1
+    split_surfels(surfels, optimizer, rows, sides)
+
+
+def counts(rows: torch.Tensor, before: int) -> tuple[int, int]:
+    """How many surfels a round split, and how many it pruned."""
+    parents = len(rows.unique())
+    return len(rows) - parents, before - parents
 
 
 def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def moments(parameter: nn.Parameter, optimizer: torch.optim.Optimizer) -> tuple[str, torch.Tensor | None]:
+    """The name of a state of the parameter's shape, and the state; None before the first step."""
+    state = optimizer.state.get(parameter, {})
+    return next(((k, x.clone()) for k, x in state.items() if x.shape == parameter.shape), ("", None))
 
 
 # Split
@@ -71,7 +94,7 @@ def test_children_tile_their_parent():
     surfels, optimizer = make(12, seed=3)
     before = nw.Surfels(rows_of(surfels))
     chosen = torch.tensor([0, 3, 4, 9])
-    split_surfels(surfels, optimizer, chosen)
+    split(surfels, optimizer, chosen)
     assert len(surfels) == 16
     uv = 3 * torch.rand(4000, 2, dtype=torch.float64) - 1.5
     edge = torch.minimum((uv.abs() - 1).abs().amin(1), uv.abs().amin(1))  # of the parent, and where its children meet
@@ -91,7 +114,7 @@ def test_split_copies_everything_else_and_leaves_others_alone():
     old = rows_of(surfels)
     chosen = torch.tensor([0, 6, 13])
     others = [i for i in range(20) if i not in chosen.tolist()]
-    split_surfels(surfels, optimizer, chosen)
+    split(surfels, optimizer, chosen)
     for name in PARAMETERS:
         assert torch.equal(getattr(surfels, name)[others], old[name][others]), name
     for name in COPIED:
@@ -104,7 +127,7 @@ def test_children_start_without_moments_and_others_keep_theirs():
     old = moments_of(surfels, optimizer)
     chosen = torch.tensor([2, 3, 17])
     others = [i for i in range(20) if i not in chosen.tolist()]
-    split_surfels(surfels, optimizer, chosen)
+    split(surfels, optimizer, chosen)
     for key, moments in moments_of(surfels, optimizer).items():
         assert len(moments) == 23, key
         assert torch.equal(moments[others], old[key][others]) and bool((old[key][others] != 0).all()), key
@@ -115,8 +138,8 @@ def test_optimizer_follows_and_goes_on_stepping():
     surfels, optimizer = make(30)
     densifier = densifier_of(surfels, budget=31, prune_opacity=0.4, fraction=0.5)
     densifier.accumulate(torch.arange(30.0))
-    split, pruned = densifier.step(surfels, optimizer, generator())
-    assert split == 1 + pruned > 1 and len(surfels) == 31
+    more, pruned = counts(densifier.step(optimizer, generator()), 30)
+    assert more == 1 + pruned > 1 and len(surfels) == 31
     for group in optimizer.param_groups:
         assert len(group["params"]) == 1 and group["params"][0] is getattr(surfels, group["name"])
     assert set(optimizer.state) == set(surfels.parameters())
@@ -135,14 +158,13 @@ def test_choice_is_without_replacement_and_proportional_to_error():
     errors = torch.tensor([1.0, 2.0, 0.0, 4.0, 8.0, 0.5, float("nan"), 3.0, -1.0])
     surfels, _ = make(len(errors))
     densifier = densifier_of(surfels)
-    densifier.accumulate(errors)
     p = errors.nan_to_num(0.0).clamp_min(0).double()
     p = p / p.sum()
     again = torch.tensor([[p[j] * p[i] / (1 - p[j]) if i != j else 0 for j in range(len(p))] for i in range(len(p))])
     expected = p + again.sum(1)
     draws, counts, source = 6000, torch.zeros(len(p), dtype=torch.float64), generator(1)
     for _ in range(draws):
-        chosen = densifier._choose(2, source)
+        chosen = densifier._choose(errors, 2, source)
         assert len(set(chosen.tolist())) == 2
         counts[chosen] += 1
     assert counts[[2, 6, 8]].tolist() == [0, 0, 0]
@@ -157,7 +179,7 @@ def test_choice_is_deterministic_given_the_generator():
         surfels, optimizer = make(60)
         densifier = densifier_of(surfels, fraction=0.2)
         densifier.accumulate(torch.linspace(0, 1, 60))
-        densifier.step(surfels, optimizer, generator(seed))
+        densifier.step(optimizer, generator(seed))
         return rows_of(surfels)
 
     torch.manual_seed(1)
@@ -179,9 +201,9 @@ def test_budget_holds_over_many_rounds(budget):
     for _ in range(80):
         count = len(surfels)
         densifier.accumulate(torch.rand(count, generator=source))
-        split, pruned = densifier.step(surfels, optimizer, source)
-        assert pruned == 0 and len(surfels) == count + split
-        assert split == min(budget, math.floor(1.05 * count + 1e-9)) - count
+        more, pruned = counts(densifier.step(optimizer, source), count)
+        assert pruned == 0 and len(surfels) == count + more
+        assert more == min(budget, math.floor(1.05 * count + 1e-9)) - count
         assert len(surfels) <= budget and densifier.errors.shape == (len(surfels),)
     assert len(surfels) == budget
 
@@ -195,7 +217,7 @@ def test_prune_removes_exactly_the_transparent_ones():
     old, moments = rows_of(surfels), moments_of(surfels, optimizer)
     densifier = densifier_of(surfels, budget=8)
     densifier.accumulate(torch.tensor([1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0]))  # no error of those that stay
-    assert densifier.step(surfels, optimizer, generator()) == (0, 4)
+    assert counts(densifier.step(optimizer, generator()), 8) == (0, 4)
     kept = [2, 3, 4, 6]
     for name in PARAMETERS:
         assert torch.equal(getattr(surfels, name), old[name][kept]), name
@@ -211,11 +233,11 @@ def test_prune_at_the_cap_is_a_choice(at_cap, changed):
         surfels.logit_opacities[:3] = -8.0
     densifier = densifier_of(surfels, budget=10, prune_at_cap=at_cap, fraction=0.5)
     densifier.accumulate(torch.ones(10))
-    assert densifier.step(surfels, optimizer, generator()) == (changed, changed)
+    assert counts(densifier.step(optimizer, generator()), 10) == (changed, changed)
     assert len(surfels) == 10 and int((surfels.logit_opacities < -7).sum()) == 3 - changed
 
 
-def addresses(surfels: nw.Surfels, optimizer: torch.optim.Adam, densifier: Densifier) -> list[int]:
+def addresses(surfels: nw.Surfels, optimizer: torch.optim.Adam, densifier: DensityControl) -> list[int]:
     """Of all tensors that a CUDA graph of a training step reads and writes."""
     moments = [x for state in optimizer.state.values() for x in state.values()]
     return [x.data_ptr() for x in (*surfels.parameters(), *moments, densifier.errors)]
@@ -238,9 +260,9 @@ def test_at_the_budget_children_take_the_rows_of_pruned_surfels():
     before, old, moments = addresses(surfels, optimizer, densifier), rows_of(surfels), moments_of(surfels, optimizer)
     alone, alone_optimizer = make(20)
     alone.load_state_dict(surfels.state_dict())
-    assert densifier.step(surfels, optimizer, generator(), unneeded) == (3, 3)
+    assert counts(densifier.step(optimizer, generator(), unneeded), 20) == (3, 3)
     assert addresses(surfels, optimizer, densifier) == before and not densifier.errors.any()
-    split_surfels(alone, alone_optimizer, torch.tensor(parents))
+    split(alone, alone_optimizer, torch.tensor(parents))
     others = [i for i in range(20) if i not in (*gone, *parents)]
     for name in PARAMETERS:
         now = getattr(surfels, name)
@@ -256,12 +278,12 @@ def test_places_are_filled_before_rows_are_appended():
         surfels.logit_opacities[[3, 8]] = -8.0
     densifier = densifier_of(surfels, budget=21, fraction=0.2)
     densifier.accumulate(torch.ones(20))
-    assert densifier.step(surfels, optimizer, generator()) == (3, 2)
+    assert counts(densifier.step(optimizer, generator()), 20) == (3, 2)
     assert len(surfels) == 21 and bool((surfels.opacities > 0.4).all()) and densifier.errors.shape == (21,)
 
 
-@pytest.mark.parametrize(("fraction", "candidates", "split"), [(0.0, 16, 0), (0.05, 16, 1), (0.5, 1, 1), (0.5, 16, 4)])
-def test_pruned_surfels_go_where_too_few_are_split(fraction, candidates, split):
+@pytest.mark.parametrize(("fraction", "candidates", "more"), [(0.0, 16, 0), (0.05, 16, 1), (0.5, 1, 1), (0.5, 16, 4)])
+def test_pruned_surfels_go_where_too_few_are_split(fraction, candidates, more):
     """The fraction of the surfels and those that have an error are bounds; rows without a child are removed."""
     surfels, optimizer = make(20)
     gone = [1, 5, 6, 19]
@@ -275,11 +297,11 @@ def test_pruned_surfels_go_where_too_few_are_split(fraction, candidates, split):
     errors[gone] = 9.0
     densifier.accumulate(errors)
     means = surfels.means.detach().clone()
-    assert densifier.step(surfels, optimizer, generator()) == (split, 4)
-    assert len(surfels) == 16 + split and bool((surfels.logit_opacities > 0).all())
-    assert densifier.errors.shape == (16 + split,) and all(len(p) == 16 + split for p in optimizer.state)
+    assert counts(densifier.step(optimizer, generator()), 20) == (more, 4)
+    assert len(surfels) == 16 + more and bool((surfels.logit_opacities > 0).all())
+    assert densifier.errors.shape == (16 + more,) and all(len(p) == 16 + more for p in optimizer.state)
     unmoved = [bool((surfels.means == mean).all(dim=1).any()) for mean in means[stay]]
-    assert unmoved.count(False) == split and not any(bool((surfels.means == x).all(dim=1).any()) for x in means[gone])
+    assert unmoved.count(False) == more and not any(bool((surfels.means == x).all(dim=1).any()) for x in means[gone])
 
 
 def test_a_round_that_splits_prunes_in_either_mode():
@@ -288,7 +310,7 @@ def test_a_round_that_splits_prunes_in_either_mode():
         surfels.logit_opacities[:3] = -8.0
     densifier = densifier_of(surfels, budget=21, prune_at_cap=False)
     densifier.accumulate(torch.eye(20)[10])
-    assert densifier.step(surfels, optimizer, generator()) == (1, 3) and len(surfels) == 18
+    assert counts(densifier.step(optimizer, generator()), 20) == (1, 3) and len(surfels) == 18
 
 
 def test_chosen_ones_are_removed_but_never_the_most_opaque():
@@ -296,14 +318,40 @@ def test_chosen_ones_are_removed_but_never_the_most_opaque():
     with torch.no_grad():
         surfels.logit_opacities.copy_(torch.tensor([0.0, 1.0, -9.0, 2.0, 0.5]))
     old, moments = rows_of(surfels), moments_of(surfels, optimizer)
-    densifier = densifier_of(surfels)
+    densifier = densifier_of(surfels, fraction=0.0, prune_opacity=0.0)
     densifier.accumulate(torch.arange(5.0))
-    assert densifier.remove(surfels, optimizer, torch.zeros(5, dtype=torch.bool)) == 0
-    assert densifier.remove(surfels, optimizer, torch.tensor([True, False, False, True, True])) == 2
+    assert densifier.step(optimizer, unneeded=torch.zeros(5, dtype=torch.bool)).tolist() == [0, 1, 2, 3, 4]
     kept = [1, 2, 3]
+    assert densifier.step(optimizer, unneeded=torch.tensor([True, False, False, True, True])).tolist() == kept
     assert all(torch.equal(getattr(surfels, name), old[name][kept]) for name in PARAMETERS)
     assert all(torch.equal(now, moments[key][kept]) for key, now in moments_of(surfels, optimizer).items())
     assert densifier.errors.tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize("kind", [torch.optim.Adam, lambda p, lr: torch.optim.SGD(p, lr, momentum=0.9)])
+@pytest.mark.parametrize("budget", [24, 80])
+def test_a_loop_of_ones_own_takes_along_what_belongs_to_surfels(kind, budget):
+    """Parameters of a module, a buffer and plain tensors follow the row map; an optimizer's state, too."""
+    surfels, extra = make_surfels(random_scene(20)), nn.Module()
+    extra.register_parameter("features", nn.Parameter(torch.rand(20, 5)))
+    extra.register_buffer("numbers", torch.arange(20))
+    optimizer = kind([{"params": surfels.parameters()}, {"params": extra.parameters()}], lr=1e-3)
+    control = nw.DensityControl(surfels, nw.Config(max_surfels=budget, densify=DensifyConfig(fraction=0.4)))
+    for _ in range(3):
+        numbers, (key, state) = extra.numbers.clone(), moments(extra.features, optimizer)
+        before = len(surfels)
+        control.accumulate(torch.rand(before))
+        rows = control.step(optimizer, generator(), along=[(extra, "features"), (extra, "numbers")])
+        assert len(surfels) == len(rows) > before and torch.equal(extra.numbers, numbers[rows])
+        assert optimizer.param_groups[1]["params"] == [extra.features]
+        children = torch.bincount(rows)[rows] > 1
+        now = optimizer.state.get(extra.features, {}).get(key)
+        if state is not None:
+            assert torch.equal(now[~children], state[rows[~children]]) and not now[children].any()
+        (sum(p.sum() for p in surfels.parameters()) + extra.features.square().sum()).backward()
+        optimizer.step()
+        if before >= budget:
+            break
 
 
 # When

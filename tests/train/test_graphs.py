@@ -15,9 +15,8 @@ from nexwarp import ops
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.model import graphs as step_graphs
-from nexwarp.model.surfels import Surfels
 from nexwarp.train import views as training_views
-from nexwarp.train.densify import Densifier
+from nexwarp.train.densify import DensityControl
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.settings import with_settings
 from nexwarp.train.target import Target
@@ -262,22 +261,22 @@ def test_rounds_at_the_budget_keep_the_graph(tiny_scene: Scene, monkeypatch: pyt
     trainer = Trainer(tiny_scene, Config(**(SETTINGS | changes)), "cuda")
     captured: list[int] = []
     replaced: list[int] = []
-    capture, control = step_graphs._Stage.capture, Densifier.step
+    capture, control = step_graphs._Stage.capture, DensityControl.step
 
     def noted(*given: Any) -> None:
         captured.append(trainer.iteration)
         capture(*given)
 
-    def counted(densifier: Densifier, surfels: Surfels, *given: Any) -> tuple[int, int]:
-        before = len(surfels)
-        found = control(densifier, surfels, *given)
-        if found[0] and before == len(surfels):
+    def counted(densifier: DensityControl, *given: Any) -> torch.Tensor:
+        before = len(densifier.surfels)
+        rows = control(densifier, *given)
+        if len(rows.unique()) < len(rows) == before:
             replaced.append(trainer.iteration)
-        return found
+        return rows
 
     monkeypatch.setattr(ops, "fits", lambda room: True)  # short lists are slow but right, and no reason here
     monkeypatch.setattr(step_graphs._Stage, "capture", noted)
-    monkeypatch.setattr(Densifier, "step", counted)
+    monkeypatch.setattr(DensityControl, "step", counted)
     trainer.run()
     assert len(replaced) > 3 and captured
     assert not [i for i in captured if replaced[0] < i <= trainer.densifier.config.stop]

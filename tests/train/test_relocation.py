@@ -10,9 +10,10 @@ from nexwarp.cameras.camera import Camera, reduced
 from nexwarp.data import Scene
 from nexwarp.model.render import render
 from nexwarp.train import densify
-from nexwarp.train.densify import Densifier, least_contributing
+from nexwarp.train import trainer as trainers
+from nexwarp.train.densify import DensityControl, least_contributing
 from nexwarp.train.ranks.ranks import Ranks
-from nexwarp.train.recipe import DensifyConfig
+from nexwarp.train.recipe import Config, DensifyConfig
 from nexwarp.train.trainer import Trainer
 from tests.ranks_support import run_ranks
 from tests.scenes import make_surfels, random_scene
@@ -72,11 +73,15 @@ def test_ranks_share_the_views(scene: Scene, tmp_path: Path) -> None:
 
 def test_rounds_at_the_budget_relocate_in_the_first_part_of_density_control() -> None:
     surfels = make_surfels(random_scene(100))
-    densifier = Densifier(DensifyConfig(start=0, stop=1000, every=5, relocate=0.1), surfels, 100)
-    due = [i for i in range(1, 1001) if densifier.due(i) and densifier.relocates(i, 100)]
+    schedule = DensifyConfig(start=1, stop=1000, every=5, relocate=0.1)
+    config = Config(max_surfels=100, densify=schedule)
+    densifier = DensityControl(surfels, config)
+    due = [i for i in range(1, 1001) if densifier.due(i) and densifier.relocates(i)]
     assert due == list(range(50, 600, 50))
-    assert densifier.relocates(50, 98) and not densifier.relocates(50, 97)
-    assert not Densifier(DensifyConfig(stop=1000, every=5, relocate=0.0), surfels, 100).relocates(50, 100)
+    assert DensityControl(surfels, dataclasses.replace(config, max_surfels=102)).relocates(50)
+    assert not DensityControl(surfels, dataclasses.replace(config, max_surfels=103)).relocates(50)
+    never = dataclasses.replace(config, densify=dataclasses.replace(schedule, relocate=0.0))
+    assert not DensityControl(surfels, never).relocates(50)
     with pytest.raises(ValueError, match=r"relocate: expected at least 0 and at most 0\.5, got 0\.6"):
         DensifyConfig(relocate=0.6)
 
@@ -84,11 +89,11 @@ def test_rounds_at_the_budget_relocate_in_the_first_part_of_density_control() ->
 def test_others_take_their_place(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     removed = []
 
-    def first(model, cameras, share, _):
+    def first(model, cameras, share):
         removed.append((trainer.iteration, len(model.surfels), len(cameras), share))
         return torch.arange(len(model.surfels)) < share * len(model.surfels)
 
-    monkeypatch.setattr(densify, "least_contributing", first)
+    monkeypatch.setattr(trainers, "least_contributing", first)
     config = small(iterations=120, densify=dataclasses.replace(OFTEN, relocate=0.2, prune_opacity=0.0, fraction=0.2))
     budget = 50
     trainer = Trainer(scene, dataclasses.replace(config, max_surfels=budget), "cpu")
