@@ -28,7 +28,7 @@ def texturing(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[M
     positions.requires_grad_()
 
     def colors() -> torch.Tensor:
-        return field.colors(positions, depths, directions, focal)
+        return field.evaluate(positions, depths, directions, focal)
 
     facts = scene.facts
     facts["sizes"] |= {"slots": hits.ids.numel(), "hits": int((hits.ids >= 0).sum())}

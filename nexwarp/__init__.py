@@ -38,10 +38,10 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
 from nexwarp.model.options import RenderOptions
-from nexwarp.model.rasterize import Hits, compose, rasterize
+from nexwarp.model.rasterize import compose, rasterize
 from nexwarp.model.render import Rendering, render
 from nexwarp.model.surfels import Surfels
-from nexwarp.model.texture import NeuralTexture
+from nexwarp.model.texture import Hits, NeuralTexture, Texture, register_texture
 from nexwarp.ops import tape as tape
 from nexwarp.train.api import train
 from nexwarp.train.densify import DensityControl
@@ -66,6 +66,7 @@ __all__ = [
     "StepReport",
     "Surfels",
     "Target",
+    "Texture",
     "Trainer",
     "View",
     "compose",
@@ -74,6 +75,7 @@ __all__ = [
     "load_scene",
     "preset",
     "rasterize",
+    "register_texture",
     "render",
     "train",
 ]

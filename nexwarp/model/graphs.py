@@ -32,7 +32,7 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Color, RenderOptions, color_numbers
 from nexwarp.model.render import Rendering, draw
 from nexwarp.model.surfels import Surfels
-from nexwarp.model.texture import NeuralTexture
+from nexwarp.model.texture import NeuralTexture, Texture
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +86,7 @@ class Frame:
     """What a frame renders: the arguments of `draw`."""
 
     surfels: Surfels
-    texture: NeuralTexture | None
+    texture: Texture | None
     exposures: Exposures | None
     limits: DetailLimits | None
     camera: Camera | RayCamera
@@ -108,12 +108,13 @@ class Frame:
     @functools.cached_property
     def state(self) -> Hashable:
         """What the launches depend on beside the kind; changes of values in place do not count."""
-        texture, exposures, products = self.texture, self.exposures, torch.backends.cuda.matmul
+        exposures, products = self.exposures, torch.backends.cuda.matmul
+        neural = self.texture if isinstance(self.texture, NeuralTexture) else None
         return (
             *((x.data_ptr(), x.shape) for x in self.tensors),
-            texture and (texture.half_precision, texture.residual, texture.down_weighting, texture.sh_degree),
+            neural and (neural.half_precision, neural.residual, neural.down_weighting, neural.sh_degree),
             # Brought up to date here: a graph reads the copy, where there is one, and not the grid.
-            texture and texture.half_copy_key() and texture.half_copy().data_ptr(),
+            neural and neural.half_copy_key() and neural.half_copy().data_ptr(),
             exposures and exposures.lens,
             torch.are_deterministic_algorithms_enabled(),
             products.allow_tf32,
@@ -422,6 +423,8 @@ def _can_capture(device: torch.device, frame: Frame) -> bool:
     """Whether a frame fits the tensors that a graph reads, needs no gradients and is none of a larger graph."""
     camera, background = frame.camera, frame.background
     if not isinstance(camera, Camera) or isinstance(camera, StagedCamera):
+        return False
+    if frame.texture is not None and type(frame.texture) is not NeuralTexture:  # it may depend on anything
         return False
     if camera.width * camera.height * max(frame.options.max_hits, 1) > MOST_POINTS:
         return False

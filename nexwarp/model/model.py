@@ -19,7 +19,7 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Color, RenderChanges, RenderOptions
 from nexwarp.model.render import Rendering
 from nexwarp.model.surfels import Surfels
-from nexwarp.model.texture import NeuralTexture
+from nexwarp.model.texture import Texture
 
 
 class Model(nn.Module):
@@ -29,7 +29,7 @@ class Model(nn.Module):
 
     Attributes:
         surfels: the N surfels, float32.
-        texture: the neural texture, float32; None for a model without texture.
+        texture: a `NeuralTexture`, or one of your own, float32; None for a model without texture.
         exposures: gains of the training photos and the falloff of their lens; None renders at the mean exposure.
         detail_limits: detail limits of the N surfels; None limits nothing.
         options: the options of its rendering.
@@ -41,14 +41,14 @@ class Model(nn.Module):
     """
 
     surfels: Surfels
-    texture: NeuralTexture | None
+    texture: Texture | None
     exposures: Exposures | None
     detail_limits: DetailLimits | None
 
     def __init__(
         self,
         surfels: Surfels,
-        texture: NeuralTexture | None,
+        texture: Texture | None,
         exposures: Exposures | None = None,
         detail_limits: DetailLimits | None = None,
         options: RenderOptions | None = None,
@@ -58,7 +58,7 @@ class Model(nn.Module):
         if not isinstance(surfels, Surfels):
             raise TypeError(f"surfels: expected a nexwarp.Surfels, got {type(surfels).__name__}")
         for name, value, kind in (
-            ("texture", texture, NeuralTexture),
+            ("texture", texture, Texture),
             ("exposures", exposures, Exposures),
             ("detail_limits", detail_limits, DetailLimits),
             ("options", options, RenderOptions),
@@ -182,6 +182,8 @@ class Model(nn.Module):
 
         Raises:
             OSError: the file cannot be written; an existing file stays unchanged.
+            TypeError, ValueError: the texture is of your own, and `load` could not make it again; see
+                `nexwarp.register_texture`.
         """
         from nexwarp.model.model_file import save_model
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import operator
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import cast
 import torch
 
 from nexwarp.cameras.cameras_file import origin_of
-from nexwarp.errors import FormatError, MissingError, check_range, check_tensors, check_version
+from nexwarp.errors import FormatError, MissingError, check_finite, check_range, check_tensors, check_version
 from nexwarp.io.files import one_line, write_atomically
 from nexwarp.io.json_files import Json, parse_json
 from nexwarp.io.safetensors_files import check_tensors_header
@@ -22,12 +23,14 @@ from nexwarp.model.exposures import SHAPES, Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions, check_removed
 from nexwarp.model.surfels import PARAMETERS, Surfels
-from nexwarp.model.texture import NeuralTexture, TextureShape
+from nexwarp.model.texture import NeuralTexture, Texture, TextureShape, registered_texture
 
 FORMAT_VERSION = 1
 COMPACT_VERSION = 2  # of compact files, which older readers cannot read
 SUFFIX = ".safetensors"
 MODEL_FILE = "model.safetensors"
+KIND = "kind"  # in the metadata of a texture: the name of a registered class
+OWN = "own_texture."  # first part of the names of its tensors
 FRAME = "COLMAP world, cameras x right, y down, z forward"
 DTYPES = ("F16", "F32")
 
@@ -49,7 +52,10 @@ def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = Fa
     from safetensors.torch import save
 
     tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}
-    if model.texture is not None:
+    shape = _texture_record(model.texture)
+    if shape is not None and KIND in shape:
+        tensors |= {f"{OWN}{name}": x for name, x in model.texture.state_dict().items()}
+    elif model.texture is not None:
         for name, x in model.texture.state_dict().items():
             tensors[f"texture.{name}"] = x.clone() if name == "resolutions" else x.half()
     if model.detail_limits is not None:
@@ -64,13 +70,54 @@ def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = Fa
         "low_pass": False,  # which older versions expect
         "format_version": COMPACT_VERSION if compact else FORMAT_VERSION,
         "frame": FRAME,
-        "texture": None if model.texture is None else model.texture.config,
+        "texture": shape,
     }
     file = Path(path)
     if file.suffix != SUFFIX or file.is_dir():
         file = file / MODEL_FILE
     write_atomically(file, save(tensors, {"nexwarp": json.dumps(meta)}))
     return file
+
+
+def _texture_record(texture: Texture | None) -> dict[str, Json] | None:
+    """Return what a file says of a texture; TypeError or ValueError for one that `load` could not make again."""
+    if texture is None:
+        return None
+    if type(texture) is NeuralTexture:
+        return cast(dict[str, Json], texture.config)
+    name, config = type(texture).__name__, getattr(texture, "config", None)
+    if registered_texture(name) is not type(texture):
+        raise TypeError(
+            f"texture: expected a nexwarp.NeuralTexture or a registered class, got {name}; nexwarp.load can only make "
+            "classes again that nexwarp.register_texture knows"
+        )
+    if not isinstance(config, Mapping):
+        raise TypeError(f"texture.config: expected the keyword arguments of {name}, got {config!r:.60}")
+    record: dict[str, Json] = {KIND: name, "config": dict(config)}
+    try:
+        again = _own_texture(json.loads(json.dumps(record))).state_dict()
+    except Exception as error:  # whatever the class raises
+        raise ValueError(f"texture.config: {name} cannot be made of it ({one_line(error)})") from error
+    state = texture.state_dict()
+    shapes = ({key: (x.dtype, x.shape) for key, x in tensors.items()} for tensors in (state, again))
+    if operator.ne(*shapes):
+        raise ValueError(f"texture.config: expected arguments that give tensors as those of the {name} to save")
+    for key, x in state.items():
+        if x.dtype != torch.float32:
+            raise ValueError(f"texture.{key}: expected float32, which files keep, got {x.dtype}")
+        check_finite(f"texture.{key}", x)
+    return record
+
+
+def _own_texture(record: Mapping[str, Json]) -> Texture:
+    """Make a registered texture of its record in a file; ValueError where nobody has registered it."""
+    kind = registered_texture(str(record[KIND]))
+    if kind is None:
+        raise ValueError(f"texture: expected {record[KIND]!r:.60} to be registered, see nexwarp.register_texture")
+    config = record["config"]
+    assert isinstance(config, dict)
+    with torch.random.fork_rng(devices=[]):  # a training goes on after it is saved
+        return kind(**config)
 
 
 def load(path: str | os.PathLike[str]) -> Model:
@@ -99,14 +146,15 @@ def load(path: str | os.PathLike[str]) -> Model:
             meta = _read_metadata(path, (file.metadata() or {}).get("nexwarp"))
             compact = meta["format_version"] == COMPACT_VERSION
             options, shape = _read_options(meta), _read_texture_shape(meta)
-            texture_shapes = _shapes_of(shape)
+            texture = _empty_texture(shape)
+            texture_shapes = {name: list(x.shape) for name, x in _stored_state(texture).items()}
             # Tensors that this version does not know are passed over.
             known = FIXED_NAMES | texture_shapes.keys() | (CODE_NAMES if compact else set())
             names = [name for name in file.keys() if name in known]
             kinds = {name: (file.get_slice(name).get_dtype(), file.get_slice(name).get_shape()) for name in names}
             _check_kinds(kinds, texture_shapes, compact)
             tensors = {name: file.get_tensor(name) for name in names}
-        return _make_model(decode(tensors) if compact else tensors, options, shape, meta)
+        return _make_model(decode(tensors) if compact else tensors, options, texture, meta)
     except FormatError:
         raise
     except (SafetensorError, OSError) as error:
@@ -151,7 +199,7 @@ def _read_options(meta: dict[str, Json]) -> RenderOptions:
     return RenderOptions(**values)  # type: ignore[arg-type]  # the constructor checks the types
 
 
-def _read_texture_shape(meta: dict[str, Json]) -> TextureShape | None:
+def _read_texture_shape(meta: dict[str, Json]) -> dict[str, Json] | None:
     """Remove the arguments of the texture from the metadata and return them; the constructor checks their values."""
     shape = meta.pop("texture")
     if shape is None:
@@ -160,16 +208,27 @@ def _read_texture_shape(meta: dict[str, Json]) -> TextureShape | None:
         raise ValueError(f"texture: expected the settings of a texture, got {shape!r:.60}")
     if "parts" in shape:
         raise ValueError("texture: expected one texture: models merged from blocks were removed after 7f7bd6c")
-    return cast(TextureShape, {name: x for name, x in shape.items() if name in TextureShape.__annotations__})
+    if KIND in shape:
+        return shape
+    return {name: x for name, x in shape.items() if name in TextureShape.__annotations__}
 
 
-def _shapes_of(shape: TextureShape | None) -> dict[str, list[int]]:
-    """Return names and shapes of a texture's tensors; allocate nothing, even if the metadata gives huge sizes."""
+def _empty_texture(shape: dict[str, Json] | None) -> Texture | None:
+    """Make the texture of a file, without its values; allocate nothing, even if the metadata gives huge sizes."""
     if shape is None:
-        return {}
+        return None
+    if KIND in shape:
+        return _own_texture(shape)
     with torch.device("meta"):
-        state = NeuralTexture(**shape).state_dict()
-    return {f"texture.{name}": list(x.shape) for name, x in state.items()}
+        return NeuralTexture(**cast(TextureShape, shape))
+
+
+def _stored_state(texture: Texture | None) -> dict[str, torch.Tensor]:
+    """Return a texture's parameters and buffers by their names in a file."""
+    if texture is None:
+        return {}
+    prefix = "texture." if type(texture) is NeuralTexture else OWN
+    return {f"{prefix}{name}": x for name, x in texture.state_dict().items()}
 
 
 def _check_kinds(
@@ -191,7 +250,7 @@ def _check_kinds(
 
 
 def _make_model(
-    tensors: Mapping[str, torch.Tensor], options: RenderOptions, shape: TextureShape | None, meta: dict[str, Json]
+    tensors: Mapping[str, torch.Tensor], options: RenderOptions, texture: Texture | None, meta: dict[str, Json]
 ) -> Model:
     """Make a model from a full file's tensors and metadata; raise an error if they do not fit."""
     surfels = Surfels(_part(tensors, "surfels."))
@@ -204,11 +263,15 @@ def _make_model(
     parts = _part(tensors, "exposures.")
     exposures = Exposures(parts) if parts else None
     check_bounds(tensors)
-    texture = None
-    if shape is not None:
-        texture = NeuralTexture(**shape)
+    if type(texture) is NeuralTexture:
+        texture = NeuralTexture(**texture.config)
         texture.load_state_dict(_part(tensors, "texture."))
         texture.half_precision = fits_half(tensors)
+    elif texture is not None:
+        own = _part(tensors, OWN)
+        for name, x in own.items():
+            check_finite(f"{OWN}{name}", x)
+        texture.load_state_dict(own)
     return Model(surfels, texture, exposures, limits, options, meta)
 
 

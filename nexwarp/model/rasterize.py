@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy.typing as npt
 import torch
@@ -14,32 +13,10 @@ from nexwarp.errors import check_tensors
 from nexwarp.model.options import Color, RenderOptions, color_tensor
 from nexwarp.model.render import check_camera, memory_error, pinhole_of, prepare_device
 from nexwarp.model.surfels import Activated, check_coefficients
+from nexwarp.model.texture import Hits
 from nexwarp.ops.collect import CHANNELS
 
 Values = torch.Tensor | npt.ArrayLike  # arrays and lists become tensors of the camera's dtype, on its device
-
-
-@dataclass(frozen=True)
-class Hits:
-    """What `rasterize` finds in each pixel. All but `ids` are differentiable; with cameras in a list, all are stacked.
-
-    Attributes:
-        ids: (H, W, K) int32, surfels of the K heaviest hits, heaviest first; -1 in empty slots.
-        depths: (H, W, K) their z-depths, world units; 0 in empty slots.
-        weights: (H, W, K) their blending weights; 0 in empty slots.
-        plain: (H, W, D) blended colours of all other hits (N of paper Eq. 6), and of the background where one is given.
-        alpha: (H, W) 1 - final transmittance.
-        points: (H, W, K, 3) the hits, world frame; the camera's position in empty slots.
-        directions: (H, W, 3) unit directions of the pixels' rays, world frame.
-    """
-
-    ids: torch.Tensor
-    depths: torch.Tensor
-    weights: torch.Tensor
-    plain: torch.Tensor
-    alpha: torch.Tensor
-    points: torch.Tensor
-    directions: torch.Tensor
 
 
 def rasterize(  # noqa: PLR0913  # gsplat's order of arguments

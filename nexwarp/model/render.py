@@ -1,6 +1,6 @@
 """From model parts to pixels: antialias, project, tiles, collect, texture, compose (paper Sec. 4.2)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -14,7 +14,7 @@ from nexwarp.model.detail_limits import DetailLimits, limited_depths
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Color, RenderOptions, color_tensor
 from nexwarp.model.surfels import Activated, Surfels
-from nexwarp.model.texture import NeuralTexture
+from nexwarp.model.texture import Hits, NeuralTexture, Texture
 from nexwarp.ops.rays import RayHits, collect_rays, intersect_rays, ray_records
 from nexwarp.ops.tiles import Order
 
@@ -153,7 +153,7 @@ class RayRendering(Rendering):
 
 def render(
     surfels: Surfels,
-    texture: NeuralTexture | None,
+    texture: Texture | None,
     camera: Camera,
     max_hits: int = 2,
     background: Color = (0.0, 0.0, 0.0),
@@ -168,7 +168,7 @@ def render(
 
     Args:
         surfels: the N surfels, N >= 0, float32 or float64.
-        texture: the neural texture, on the same device; None leaves all hits their plain colours.
+        texture: a `NeuralTexture`, or one of your own, on the same device; None leaves all hits their plain colours.
         camera: the camera, on the same device.
         max_hits: K, number of hits textured in each pixel, 0 to 8.
         background: a number, three numbers or a (3,) tensor, weighted by the final transmittance. The values of a CUDA
@@ -190,8 +190,8 @@ def render(
         raise TypeError(f"surfels: expected a nexwarp.Surfels, got {type(surfels).__name__}")
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
-    if texture is not None and not isinstance(texture, NeuralTexture):
-        raise TypeError(f"texture: expected a nexwarp.NeuralTexture or None, got {type(texture).__name__}")
+    if texture is not None and not isinstance(texture, Texture):
+        raise TypeError(f"texture: expected a nexwarp.Texture or None, got {type(texture).__name__}")
     if background is None:
         raise TypeError("background: expected numbers or a tensor, got None")
     options = RenderOptions(max_hits, sh_degree=sh_degree, clamp_texture=clamp_texture, order=order)
@@ -200,7 +200,7 @@ def render(
 
 def draw(
     surfels: Surfels,
-    texture: NeuralTexture | None,
+    texture: Texture | None,
     camera: Camera | RayCamera,
     options: RenderOptions,
     *,
@@ -274,7 +274,7 @@ def prepare_device(name: str, means: torch.Tensor) -> None:
 
 def _check(
     surfels: Surfels,
-    texture: NeuralTexture | None,
+    texture: Texture | None,
     camera: Camera | RayCamera,
     options: RenderOptions,
     background: torch.Tensor,
@@ -289,7 +289,7 @@ def _check(
     expected: dict[str, tuple[torch.Tensor, tuple[int, ...]]] = {"background": (background, (3,))}
     if isinstance(camera, RayCamera):
         expected["camera.rays"] = (camera.rays, (camera.height, camera.width, 3))
-    if texture is not None:
+    if isinstance(texture, NeuralTexture):
         expected["texture.grid"] = (texture.grid, tuple(texture.grid.shape))
     if jitter is not None:
         expected["jitter"] = (jitter, (camera.height, camera.width, options.max_hits))
@@ -297,7 +297,7 @@ def _check(
         expected["detail_limits.nearest"] = (limits.nearest, (len(surfels),))
         expected["detail_limits.farthest"] = (limits.farthest, (len(surfels),))
     check_tensors(expected, dtype=dtype, device=device)
-    stored = (0, dtype) if texture is None else texture.stored_per_point(options.sh_degree)
+    stored = texture.stored_per_point(options.sh_degree) if isinstance(texture, NeuralTexture) else (0, dtype)
     ops.check_image(camera.width, camera.height, options.max_hits, dtype, device, texture=stored)
 
 
@@ -369,7 +369,7 @@ def _axes(shape: Activated, viewmat: torch.Tensor) -> torch.Tensor:
 
 
 def _texels(
-    texture: NeuralTexture,
+    texture: Texture,
     camera: Camera | RayCamera,
     hits: ops.Hits | RayHits,
     options: RenderOptions,
@@ -382,11 +382,17 @@ def _texels(
         positions, directions = _unproject_rays(shifted, camera)
     else:
         positions, directions = ops.unproject(shifted, camera.viewmat, pinhole_of(camera, shifted))
+    found = Hits(hits.ids, hits.depths, hits.weights, hits.plain, hits.alpha, positions, directions)
+    if not isinstance(texture, NeuralTexture):
+        colors = texture.colors(found, camera)
+        expected = {"texture.colors": (colors, tuple(positions.shape))}
+        check_tensors(expected, dtype=positions.dtype, device=positions.device)
+        return (colors.clamp_min(0) if options.clamp_texture else colors).contiguous()
     depths = hits.depths
     if isinstance(camera, RayCamera) and camera.parallel:  # empty slots keep 0, which the texture passes over
         depths = (hits.weights > 0).to(hits.depths)
-    depths, clamp = limited_depths(hits.ids, depths, limits, camera.focal), options.clamp_texture
-    return texture.colors(positions, depths, directions, camera.focal, sh_degree=options.sh_degree, clamp=clamp)
+    found = replace(found, depths=limited_depths(hits.ids, depths, limits, camera.focal))
+    return texture.colors(found, camera, sh_degree=options.sh_degree, clamp=options.clamp_texture)
 
 
 def _unproject_rays(depths: torch.Tensor, camera: RayCamera) -> tuple[torch.Tensor, torch.Tensor]:

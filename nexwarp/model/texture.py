@@ -1,15 +1,18 @@
-"""The neural texture: one field for all surfels, a hash grid and a small MLP (paper Sec. 4.1)."""
+"""Textures: what any has in common, and the neural texture, a hash grid and a small MLP (paper Sec. 4.1)."""
 
 import itertools
 import math
-from collections.abc import Hashable
-from typing import TypedDict
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass
+from typing import TypedDict, TypeVar
 
 import torch
 from torch import nn
 from typing_extensions import Unpack
 
 from nexwarp import ops
+from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.errors import check_range, check_tensors
 from nexwarp.kernels.types import MAX_SH_DEGREE
 from nexwarp.ops import fused_texture
@@ -21,6 +24,85 @@ LARGEST_RESOLUTION = 1e9
 
 # Focal length in pixels at which no level is down-weighted: every cell is larger than a pixel.
 FOCAL_WITHOUT_DOWN_WEIGHTING = 1e12
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What a picture's rays hit. All but `ids` are differentiable; `rasterize` stacks those of several cameras.
+
+    Attributes:
+        ids: (H, W, K) int32, surfels of the K heaviest hits, heaviest first; -1 in empty slots.
+        depths: (H, W, K) their z-depths, world units; 0 in empty slots.
+        weights: (H, W, K) their blending weights; 0 in empty slots.
+        plain: (H, W, D) blended colours of all other hits (N of paper Eq. 6), and of the background where one is given.
+        alpha: (H, W) 1 - final transmittance.
+        points: (H, W, K, 3) the hits, world frame; the camera's position in empty slots.
+        directions: (H, W, 3) unit directions of the pixels' rays, world frame.
+    """
+
+    ids: torch.Tensor
+    depths: torch.Tensor
+    weights: torch.Tensor
+    plain: torch.Tensor
+    alpha: torch.Tensor
+    points: torch.Tensor
+    directions: torch.Tensor
+
+
+class Texture(nn.Module):
+    """A texture of your own: a torch module that replaces `colors`. `render`, `Model` and `nexwarp.train` take it.
+
+    Its parameters and buffers are float32. Model files keep those of classes that `nexwarp.register_texture` knows.
+
+    Attributes:
+        residual: add the colours to the surfels' plain colours instead of replacing them.
+        rates: first and last learning rate of all its parameters, which are the parameter group "texture" of a
+            training; in between, rates fall log-linearly.
+        per_surfel: names of parameters and buffers with a row for each surfel. Density control moves their rows;
+            children take their parent's.
+        config: keyword arguments that make another of the same shape, JSON values; of registered classes.
+    """
+
+    residual: bool = False
+    rates: tuple[float, float] = (5e-3, 5e-4)
+    per_surfel: tuple[str, ...] = ()
+    config: Mapping[str, object]
+
+    def colors(self, hits: Hits, camera: Camera | RayCamera) -> torch.Tensor:
+        """Return the colours (H, W, K, 3) of hits; those in empty slots do not count, as long as they are finite."""
+        raise NotImplementedError(f"{type(self).__name__}.colors: expected a method that returns colours of hits")
+
+    def regulariser(self) -> torch.Tensor | None:
+        """Return a scalar that a training adds to its loss as it is; None adds nothing."""
+        return None
+
+
+Own = TypeVar("Own", bound=type[Texture])
+_REGISTERED: dict[str, type[Texture]] = {}
+
+
+def register_texture(kind: Own) -> Own:
+    """Make `Model.save` and `nexwarp.load` know a class of textures, by its name; also a decorator of the class.
+
+    A file keeps `config`, and parameters and buffers in float32. `load` calls the class with `config` and copies the
+    tensors into what it gets; whoever reads the file registers the class first.
+
+    Raises:
+        TypeError, ValueError: no subclass of `nexwarp.Texture`, or another class has this name.
+    """
+    if not (isinstance(kind, type) and issubclass(kind, Texture)) or kind in (Texture, NeuralTexture):
+        raise TypeError(f"kind: expected a subclass of nexwarp.Texture, got {kind!r:.60}")
+    other = _REGISTERED.get(kind.__name__, kind)
+    # A notebook's cell may run twice.
+    if (other.__module__, other.__qualname__) != (kind.__module__, kind.__qualname__):
+        raise ValueError(f"kind: expected another name, as {other.__module__} has registered {kind.__name__}")
+    _REGISTERED[kind.__name__] = kind
+    return kind
+
+
+def registered_texture(name: str) -> type[Texture] | None:
+    """Return a registered class by its name; None where there is none."""
+    return _REGISTERED.get(name)
 
 
 class TextureFlags(TypedDict, total=False):
@@ -43,7 +125,7 @@ class TextureShape(TextureFlags):
     sh_degree: int
 
 
-class NeuralTexture(nn.Module):
+class NeuralTexture(Texture):
     """World-space field G(Delta H(x)) of SH coefficients (paper Eq. 5).
 
     H are hash-grid features (paper Eq. 2), Delta the down-weighting (paper Eq. 4).
@@ -56,6 +138,7 @@ class NeuralTexture(nn.Module):
     summed in float32. Set `half_precision` to False to compute in float32. `torch.autocast` changes neither.
     """
 
+    config: TextureShape  # type: ignore[assignment]  # a mapping, too
     resolutions: torch.Tensor
     # The grid in half precision, and which grid it was: address and version.
     _half_copy: tuple[torch.Tensor, tuple[int, int]] | None = None
@@ -102,7 +185,7 @@ class NeuralTexture(nn.Module):
         for name, flag in flags.items():
             if name not in TextureFlags.__annotations__ or not isinstance(flag, bool):
                 raise TypeError(f"{name}: expected residual or down_weighting, True or False, got {flag!r}")
-        self.config: TextureShape = {
+        self.config = {
             "levels": levels,
             "table_size": table_size,
             "features": features,
@@ -190,6 +273,12 @@ class NeuralTexture(nn.Module):
         return out.T.reshape(*depths.shape, (self.sh_degree + 1) ** 2, 3)
 
     def colors(
+        self, hits: Hits, camera: Camera | RayCamera, *, sh_degree: int = MAX_SH_DEGREE, clamp: bool = False
+    ) -> torch.Tensor:
+        """Return the colours (H, W, K, 3) of hits; see `evaluate`. A subclass takes both keywords, too."""
+        return self.evaluate(hits.points, hits.depths, hits.directions, camera.focal, sh_degree=sh_degree, clamp=clamp)
+
+    def evaluate(
         self,
         positions: torch.Tensor,
         depths: torch.Tensor,

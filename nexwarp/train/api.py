@@ -4,9 +4,11 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 
 import torch
+from typing_extensions import Unpack
 
 from nexwarp.data import Scene
 from nexwarp.model.model import Model
+from nexwarp.train.initial import Start, check_start
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker
@@ -25,6 +27,7 @@ def train(
     losses: Mapping[str, OwnLoss] | None = None,
     optimizer: OptimizerMaker | None = None,
     teachers: Iterable[Model] = (),
+    **start: Unpack[Start],
 ) -> Model:
     """Train a scene and return the finished model, as `nexwarp train` does, without writing files.
 
@@ -52,6 +55,12 @@ def train(
         teachers: trained models of the scene, in place of the run's own (`config.teachers`); they are moved to the
             device. Every other step compares with a rendering of one, at the mean exposure, from a camera on the line
             through those of two photos.
+        start: `surfels`: surfels to start from instead of the scene's points, at most `config.max_surfels`, in the
+            scene's frame; SH coefficients above `config.sh_degree` are dropped. `init`: a model of the scene to start
+            from, with its texture. `texture`: a `Texture` of your own, which is trained in place; or a class or
+            function that makes one, the class without arguments, the function of the scene and the initial surfels.
+            Its parameters are trained as the group "texture" at its `rates`, and its `regulariser` is added to the
+            loss. Teachers that the run trains for itself start as ever.
 
     Returns:
         The finished model on the device.
@@ -67,13 +76,14 @@ def train(
     if config is not None and not isinstance(config, Config):
         raise TypeError(f"config: expected a nexwarp.Config or None, got {type(config).__name__}")
     config, observe = config or Config(), _observer(callbacks)
+    check_start(scene, config, start)
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
 
     def warn(message: str) -> None:
         warnings.warn(message, stacklevel=2)
 
     store = StageStore(observe, warn)
-    runner = stage_runner(scene, config, device, store, losses=losses, optimizer=optimizer, teachers=teachers)
+    runner = stage_runner(scene, config, device, store, losses=losses, optimizer=optimizer, teachers=teachers, **start)
     runner.train()
     return runner.finish()
 

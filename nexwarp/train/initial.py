@@ -1,8 +1,10 @@
-"""Makes the initial surfels, on points of the cloud, and chooses the shape of the texture."""
+"""Makes the initial surfels, on points of the cloud, and the texture; or takes those that are given."""
 
+import copy
 import dataclasses
 import math
-from typing import cast
+from collections.abc import Callable
+from typing import TypedDict, cast
 
 import numpy as np
 import torch
@@ -10,9 +12,11 @@ import torch
 from nexwarp.data import InitialPoints, Scene, View, initial_points
 from nexwarp.data.skybox import skybox_points
 from nexwarp.kernels.sh import BAND_0
+from nexwarp.model.bounds import check_bounds
+from nexwarp.model.model import Model
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import Surfels
-from nexwarp.model.texture import TextureShape
+from nexwarp.model.texture import NeuralTexture, Texture, TextureShape
 from nexwarp.train.recipe import Config
 
 INITIAL_OPACITY = 0.1
@@ -20,7 +24,83 @@ INITIAL_RAW_GAMMA = -5.0
 NUMBERS_A_PIXEL = 0.1  # of the hash grid, for each pixel of the training photos
 USUAL_SCALE = 5.0  # world units; fox, saharov and kitchen25 have 4.4 to 5.0 as COLMAP left them
 SKYBOX_SHARE = 6  # at most one initial surfel of so many lies on the sphere
+SAME_SCALE = 1e-3  # relative difference of the scales of one scene
 TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the paper's
+
+
+class Start(TypedDict, total=False):
+    """What a training starts from, in place of the scene's points and a new texture; see `nexwarp.train`."""
+
+    surfels: Surfels | None
+    init: Model | None
+    texture: Texture | type[Texture] | Callable[[Scene, Surfels], Texture] | None
+
+
+def check_start(scene: Scene, config: Config, start: Start) -> None:
+    """Raise TypeError or ValueError where what a training is to start from does not fit it."""
+    for name, value in start.items():
+        if name not in Start.__annotations__:
+            raise TypeError(f"{name}: expected no argument of this name")
+        if name != "texture" and value is not None and not isinstance(value, Surfels if name == "surfels" else Model):
+            kind = "Surfels" if name == "surfels" else "Model"
+            raise TypeError(f"{name}: expected a nexwarp.{kind} or None, got {type(value).__name__}")
+    surfels, init, texture = (start.get(name) for name in ("surfels", "init", "texture"))
+    if surfels is not None and init is not None:
+        raise ValueError("init: expected None with surfels, which are the model's otherwise")
+    if isinstance(init, Model):
+        check_scale("init", init, scene)
+        surfels = init.surfels
+    if isinstance(surfels, Surfels):
+        if not 1 <= len(surfels) <= config.max_surfels:
+            raise ValueError(f"surfels: expected 1 to max_surfels, {config.max_surfels:,}, got {len(surfels):,}")
+        check_bounds({f"surfels.{name}": x.detach() for name, x in surfels.named_parameters()})
+    if texture is not None and not isinstance(texture, Texture) and not callable(texture):
+        raise TypeError(f"texture: expected a nexwarp.Texture, or a function that makes one, got {texture!r:.60}")
+    if texture is not None and config.max_hits == 0:
+        raise ValueError("texture: expected None with max_hits = 0, which textures no hits")
+
+
+def check_scale(name: str, model: Model, scene: Scene) -> None:
+    """Raise ValueError where a model says that its scene had another scale."""
+    scale = model.meta.get("scene_scale")
+    if isinstance(scale, (int, float)) and not math.isclose(scale, scene.scale, rel_tol=SAME_SCALE):
+        raise ValueError(
+            f"{name}: expected a model of {scene.path}, whose scale is {scene.scale:.6g}, "
+            f"got one of a scene of scale {scale:.6g}"
+        )
+
+
+def given_surfels(config: Config, start: Start) -> Surfels | None:
+    """Return a copy of the surfels to start from, with the SH coefficients of the run; None where none are given."""
+    init, surfels = start.get("init"), start.get("surfels")
+    if surfels is None and init is None:
+        return None
+    raw = {name: x.detach().float().clone() for name, x in (surfels or init.surfels).state_dict().items()}
+    rest = raw["shN"][:, : (config.sh_degree + 1) ** 2 - 1]
+    raw["shN"] = torch.nn.functional.pad(rest, (0, 0, 0, (config.sh_degree + 1) ** 2 - 1 - rest.shape[1]))
+    return Surfels(raw)
+
+
+def initial_texture(scene: Scene, config: Config, surfels: Surfels, start: Start) -> Texture:
+    """Return the texture to train: the one that is given, or a copy of the model's, or a new one for the scene."""
+    init, texture = start.get("init"), start.get("texture")
+    if isinstance(texture, type):
+        texture = texture()
+    elif texture is not None and not isinstance(texture, Texture):
+        texture = texture(scene, surfels)
+    if texture is None and init is not None and config.max_hits:
+        texture = copy.deepcopy(init.texture)
+    if texture is None:
+        return NeuralTexture(**texture_shape(scene, config))
+    if not isinstance(texture, Texture):
+        raise TypeError(f"texture: expected a function that returns a nexwarp.Texture, got {type(texture).__name__}")
+    for name, x in texture.state_dict().items():
+        if x.dtype != torch.float32:
+            raise TypeError(f"texture.{name}: expected float32, got {x.dtype}")
+    for name in texture.per_surfel:
+        if (rows := len(texture.state_dict()[name])) != len(surfels):
+            raise ValueError(f"texture.{name}: expected a row for each of {len(surfels)} surfels, got {rows}")
+    return texture
 
 
 def initial_surfels(

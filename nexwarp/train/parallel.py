@@ -19,7 +19,7 @@ from nexwarp.errors import DivergedError, RankError, SceneError
 from nexwarp.machine import derived_seed, needed_memory
 from nexwarp.model.graphs import Gradients, GraphKey, StepResult, UpdateError, capturing
 from nexwarp.model.surfels import Surfels
-from nexwarp.model.texture import NeuralTexture
+from nexwarp.model.texture import NeuralTexture, Texture
 from nexwarp.train.checkpoint import Snapshot
 from nexwarp.train.densify import least_contributing
 from nexwarp.train.ranks.ranks import GradientReducer, Ranks
@@ -75,11 +75,14 @@ class ParallelTrainer(Trainer):
         ranks.share_tensors(x for _, x in self._named_parameters())
         if self.poses is not None:
             ranks.share_tensors(self.poses.buffers())
-        self.texture.drop_half_copy()
+        grid = None
+        if isinstance(self.texture, NeuralTexture):
+            self.texture.drop_half_copy()
+            grid = self.texture.grid if config.max_hits else None
         if beside is None:
             beside = sums_beside(ranks.backend, self.surfels, self.texture, config)
         self.beside = self.graphs is not None and beside
-        self.reducer = GradientReducer(self.texture.grid if config.max_hits else None)
+        self.reducer = GradientReducer(grid)
         self.reducer.overlapped = not self.beside
         self.targets.generator, self.targets.noise = torch.Generator(), torch.Generator(self.device)
         self.share = 1.0 / ranks.size
@@ -184,7 +187,7 @@ class ParallelTrainer(Trainer):
         scale_for_batch(self.optimizer, self.ranks.size)
 
 
-def sums_beside(backend: str, surfels: Surfels, texture: NeuralTexture, config: Config) -> bool:
+def sums_beside(backend: str, surfels: Surfels, texture: Texture, config: Config) -> bool:
     """Whether gradients are better summed after a step's CUDA graph: the backend cannot be captured, or there are many.
 
     The surfels are counted as many as they may become.

@@ -9,14 +9,14 @@ import torch
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import PARAMETERS, Surfels
-from nexwarp.model.texture import NeuralTexture
+from nexwarp.model.texture import NeuralTexture, Texture
 from nexwarp.ops.tiles import Order
 from nexwarp.train.adam import FusedAdam, grid_factors
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
-# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" and, where they are
-# learned, "poses"; `lr`, the learning rate of the first step.
+# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" (or "texture", of a
+# texture of one's own) and, where they are learned, "poses"; `lr`, the learning rate of the first step.
 ParameterGroup = dict[str, Any]
 EPSILON = 1e-15
 # First and last learning rates of pose corrections, radians and scene scales, in a run of 30,000 steps.
@@ -26,7 +26,7 @@ OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
 
 def make_optimizer(
     surfels: Surfels,
-    texture: NeuralTexture,
+    texture: Texture,
     config: Config,
     scale: float,
     make: OptimizerMaker | None = None,
@@ -46,8 +46,13 @@ def make_optimizer(
     """
     ends = rate_ends(config, scale)
     parts = {name: [getattr(surfels, name)] for name in PARAMETERS}
-    if config.max_hits:
-        parts |= {"grid": [texture.grid], "mlp": list(texture.mlp.parameters())}
+    rest = {name: x for name, x in texture.named_parameters() if x.requires_grad}
+    if isinstance(texture, NeuralTexture):
+        if config.max_hits:
+            parts |= {"grid": [texture.grid], "mlp": list(texture.mlp.parameters())}
+        rest = {name: x for name, x in rest.items() if name != "grid" and not name.startswith("mlp.")}
+    if rest:
+        parts["texture"], ends["texture"] = list(rest.values()), texture.rates
     if poses is not None:
         parts["poses"] = [poses.corrections]
     groups: list[ParameterGroup] = [{"params": x, "name": name, "lr": ends[name][0]} for name, x in parts.items()]
@@ -60,7 +65,7 @@ def make_optimizer(
         raise ValueError(f"optimizer: expected it to keep the parameter groups {', '.join(parts)}, got {names}")
     for group in optimizer.param_groups:
         group["ends"] = _scaled_ends(ends[group["name"]], float(group["lr"]))
-    if isinstance(optimizer, FusedAdam) and config.max_hits:
+    if isinstance(optimizer, FusedAdam) and isinstance(texture, NeuralTexture) and config.max_hits:
         optimizer.regularise(texture, grid_factors(texture, config.losses, cells_unit))
     return optimizer
 

@@ -16,6 +16,7 @@ from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.machine import derived_seed
 from nexwarp.model.model import Model
 from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
+from nexwarp.train.initial import Start
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
@@ -139,13 +140,13 @@ class StageRunner:
     def __init__(
         self,
         stages: Sequence[Stage],
-        make: Callable[[Config, Sequence[Model]], Trainer],
+        make: Callable[[Stage, Sequence[Model]], Trainer],
         store: StageStore,
         teachers: Sequence[Model] = (),
     ) -> None:
         """Make the trainer of the first stage that is not complete; no step is done yet.
 
-        `make` makes a trainer of settings and models to learn from; the student learns from `teachers` where the run
+        `make` makes a trainer of a stage and models to learn from; the student learns from `teachers` where the run
         trains none of its own.
         """
         self.stages, self.make, self.store, self.teachers = stages, make, store, teachers
@@ -159,7 +160,7 @@ class StageRunner:
 
     def _begin(self) -> None:
         self.stage = self.stages[len(self.models)]
-        self.trainer = self.make(self.stage.config, () if self.stage.teacher else self.models or self.teachers)
+        self.trainer = self.make(self.stage, () if self.stage.teacher else self.models or self.teachers)
         self.store.begin(self.stage, self.trainer)
 
     def train_teachers(self) -> None:
@@ -198,7 +199,7 @@ def stage_runner(
     """Return the runner of a training.
 
     `own` are the teachers that the run trains: None plans them, or none where `teachers`, models, are given instead.
-    `extensions` are `losses` and `optimizer` of `nexwarp.train`.
+    `extensions` are `losses` and `optimizer` of `nexwarp.train`, and what the student starts from.
     """
     models: Any = teachers if isinstance(teachers, Model) else list(teachers)  # `Trainer` says what is wrong with it
     if own is None:
@@ -208,11 +209,13 @@ def stage_runner(
     def calibration() -> ExposureCalibration | None:
         return calibrate_exposures(scene, config)
 
-    def make(settings: Config, learned_from: Sequence[Model]) -> Trainer:
+    def make(stage: Stage, learned_from: Sequence[Model]) -> Trainer:
         options = {**extensions, "teachers": learned_from, "calibrate": lambda *_: calibration()}
+        if stage.teacher:
+            options = {name: x for name, x in options.items() if name not in Start.__annotations__}
         if ranks is None or ranks.size == 1:
-            return Trainer(scene, settings, device, **options)
-        return ParallelTrainer(scene, settings, device, ranks, **options)
+            return Trainer(scene, stage.config, device, **options)
+        return ParallelTrainer(scene, stage.config, device, ranks, **options)
 
     return StageRunner(divide(config, own), make, store, models)
 

@@ -18,17 +18,17 @@ from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
 from nexwarp.model.bounds import check_bounds
 from nexwarp.model.surfels import PARAMETERS, Surfels
-from nexwarp.model.texture import NeuralTexture
+from nexwarp.model.texture import NeuralTexture, Texture
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.checkpoint import Snapshot
 from nexwarp.train.densify import DensityControl
-from nexwarp.train.initial import cells_unit, initial_poses, initial_surfels, texture_shape
+from nexwarp.train.initial import Start, cells_unit, given_surfels, initial_poses, initial_surfels, initial_texture
 from nexwarp.train.recipe import Config
 from nexwarp.train.schedules import OptimizerMaker, make_optimizer
 from nexwarp.train.settings import config_from_dict, refuse_removed
 
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
-FLOATS = ("surfels.", "texture.", "poses.", "adam.", "densify.")  # of tensors that are float32
+FLOATS = ("surfels.", "texture.", "own_texture.", "poses.", "adam.", "densify.")  # of tensors that are float32
 
 
 class TrainingState:
@@ -51,16 +51,22 @@ class TrainingState:
         device: torch.device,
         colors: torch.Tensor | None = None,
         optimizer: OptimizerMaker | None = None,
+        start: Start | None = None,
     ) -> None:
-        """Make the initial surfels, of the points' `colors` (P, 3) or else the scene's own, and the texture."""
+        """Make the initial surfels, of the points' `colors` (P, 3) or else the scene's own, and the texture.
+
+        `start` has those that are given instead.
+        """
+        start = start or {}
         self.scene = scene
         self.config = config
         self.device = device
         self.own_optimizer = optimizer
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = torch.Generator(device).manual_seed(config.seed)
-        self.surfels = initial_surfels(scene, config, self.generator, colors).to(device)
-        self.texture = NeuralTexture(**texture_shape(scene, config)).to(device)
+        surfels = given_surfels(config, start) or initial_surfels(scene, config, self.generator, colors)
+        self._surfels = surfels.to(device)
+        self._texture = initial_texture(scene, config, surfels, start).to(device)
         self.cells_unit = cells_unit(scene, config)
         self.poses = initial_poses(scene, config, device)
         self.optimizer = self._make_optimizer()
@@ -70,13 +76,25 @@ class TrainingState:
         self.seconds = 0.0
         self.rate_factor = 1.0
 
+    # Not to be assigned: the optimizer would go on to train the old ones.
+    @property
+    def surfels(self) -> Surfels:
+        """The surfels in training."""
+        return self._surfels
+
+    @property
+    def texture(self) -> Texture:
+        """The texture in training."""
+        return self._texture
+
     def _make_optimizer(self) -> torch.optim.Optimizer:
         options = (self.config, self.scene.scale, self.own_optimizer, self.cells_unit, self.poses)
         return make_optimizer(self.surfels, self.texture, *options)
 
     def _parts(self) -> dict[str, torch.nn.Module]:
         """Return what is trained, by the first words of the names in a checkpoint."""
-        parts: dict[str, torch.nn.Module] = {"surfels": self.surfels, "texture": self.texture}
+        texture = "texture" if type(self.texture) is NeuralTexture else "own_texture"  # whose names may be any
+        parts: dict[str, torch.nn.Module] = {"surfels": self.surfels, texture: self.texture}
         return parts if self.poses is None else parts | {"poses": self.poses}
 
     def _named_parameters(self) -> Iterator[tuple[str, torch.nn.Parameter]]:
@@ -121,8 +139,8 @@ class TrainingState:
     def load_snapshot(self, snapshot: Snapshot) -> None:
         """Return to a snapshot, which stays as it is; ValueError or RuntimeError where it does not fit."""
         tensors, state = {name: x.clone() for name, x in snapshot.tensors.items()}, snapshot.state
-        self.surfels = Surfels(_part(tensors, "surfels.", PARAMETERS)).to(self.device)
-        self.texture.load_state_dict(_part(tensors, "texture.", self.texture.state_dict()))
+        self._surfels = Surfels(_part(tensors, "surfels.", PARAMETERS)).to(self.device)
+        _load_texture(self.texture, _part(tensors, f"{list(self._parts())[1]}.", self.texture.state_dict()))
         if self.poses is not None:
             self.poses.load(tensors["poses.corrections"])
         self.optimizer = self._make_optimizer()
@@ -145,6 +163,17 @@ class TrainingState:
 def _part(tensors: Mapping[str, torch.Tensor], prefix: str, names: Iterable[str]) -> dict[str, torch.Tensor]:
     """Return the tensors of these names, which have a prefix in a checkpoint; a newer version may have written more."""
     return {name: tensors[prefix + name] for name in names if prefix + name in tensors}
+
+
+def _load_texture(texture: Texture, state: dict[str, torch.Tensor]) -> None:
+    """Copy a state into a texture, which may have another number of rows for surfels."""
+    for name in texture.per_surfel:
+        path, _, leaf = name.rpartition(".")
+        owner = texture.get_submodule(path)
+        old: torch.Tensor = getattr(owner, leaf)
+        new = torch.empty_like(state[name], device=old.device)
+        setattr(owner, leaf, torch.nn.Parameter(new) if isinstance(old, torch.nn.Parameter) else new)
+    texture.load_state_dict(state)
 
 
 def _is_adam(optimizer: torch.optim.Optimizer) -> bool:
@@ -243,9 +272,10 @@ def check_snapshot(snapshot: Snapshot, views: int, iterations: int) -> None:
         raise ValueError(f"order: cannot be {state['order']!r:.60}")
 
 
-def scene_digest(scene: Scene, texture: NeuralTexture) -> str:
+def scene_digest(scene: Scene, texture: Texture) -> str:
     """Return a digest of what training takes from a scene beside its cameras: photos, masks, points, scale."""
-    digest = hashlib.sha256(f"{scene.scale} {texture.config}".encode())
+    kind = texture.config if type(texture) is NeuralTexture else type(texture).__qualname__
+    digest = hashlib.sha256(f"{scene.scale} {kind}".encode())
     for view in scene.train:
         for values in (view.image, view.mask, view.alpha, view.points):
             if values is not None:  # CRC: photos are many, and nobody forges them

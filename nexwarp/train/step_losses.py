@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 import torch
 
 from nexwarp.model.render import Rendering
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops import expose
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.losses import depth_loss, grid_loss, photo_losses
@@ -18,7 +19,7 @@ OwnLoss = Callable[[Rendering, Target], torch.Tensor]
 SATURATION = 250 / 255
 # Factor of the squared pose corrections, which keeps poses near the given ones.
 POSE_PRIOR = 0.1
-BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "normals", "poses")
+BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "normals", "poses", "regulariser")
 
 
 def check_own_losses(losses: Mapping[str, OwnLoss] | None) -> dict[str, OwnLoss]:
@@ -70,7 +71,8 @@ def step_losses(
     )
     if factors.opacity > 0:
         losses["opacity"] = factors.opacity * state.surfels.opacities.mean()
-    if config.max_hits > 0 and factors.grid > 0 and not isinstance(state.optimizer, FusedAdam):
+    neural = isinstance(texture, NeuralTexture) and config.max_hits > 0
+    if neural and factors.grid > 0 and not isinstance(state.optimizer, FusedAdam):
         losses["grid"] = factors.grid * grid_loss(texture.grid, texture.resolutions * state.cells_unit)
     if target.empty is not None and factors.empty > 0:
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
@@ -80,8 +82,10 @@ def step_losses(
         losses["normals"] = target.normals * normal_loss(out, target.counts)
     if state.poses is not None and target.view is not None:
         losses["poses"] = POSE_PRIOR * state.poses.prior(target.view)
+    if (regulariser := texture.regulariser()) is not None:
+        losses["regulariser"] = _scalar("texture.regulariser", regulariser, out.image.device)
     for name, loss in (own or {}).items():
-        losses[name] = _scalar(name, loss(out, target), out.image.device)
+        losses[name] = _scalar(f"losses[{name!r}]", loss(out, target), out.image.device)
     return losses
 
 
@@ -89,8 +93,8 @@ def _scalar(name: str, value: torch.Tensor, device: torch.device) -> torch.Tenso
     """Return the value of an own loss; TypeError or ValueError where it is no floating scalar on the device."""
     if not isinstance(value, torch.Tensor) or not value.is_floating_point():
         kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
-        raise TypeError(f"losses[{name!r}]: expected a floating scalar tensor, got {kind}")
+        raise TypeError(f"{name}: expected a floating scalar tensor, got {kind}")
     if value.shape != () or value.device != device:
         got = f"shape {tuple(value.shape)} on {value.device}"
-        raise ValueError(f"losses[{name!r}]: expected a scalar tensor on {device}, got {got}")
+        raise ValueError(f"{name}: expected a scalar tensor on {device}, got {got}")
     return value

@@ -6,7 +6,6 @@ also in views that no photo has.
 
 import dataclasses
 import hashlib
-import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from functools import partial
@@ -20,12 +19,12 @@ from nexwarp.machine import derived_seed
 from nexwarp.model.graphs import MOST_GRAPHS, share_graphs, without_graphs
 from nexwarp.model.model import Model
 from nexwarp.train.exposure import ExposureCalibration
+from nexwarp.train.initial import check_scale
 from nexwarp.train.recipe import Config
 from nexwarp.train.state import TrainingState
 from nexwarp.train.target import Target, TargetSource
 
 EVERY = 2  # the second of so many steps learns from a teacher: the log's lines are of odd steps, which have photos
-SAME_SCALE = 1e-3  # share by which the scale of a teacher's scene may differ from that of the training's
 STREAM = 2  # series of random numbers, as `derived_seed` counts them; those of a view's target are 0 and 1
 
 
@@ -122,12 +121,7 @@ def check_teachers(teachers: Iterable[Model], scene: Scene, config: Config) -> l
     for number, model in enumerate(models):
         if not isinstance(model, Model):
             raise TypeError(f"teachers[{number}]: expected a nexwarp.Model, got {type(model).__name__}")
-        scale = model.meta.get("scene_scale")
-        if isinstance(scale, (int, float)) and not math.isclose(scale, scene.scale, rel_tol=SAME_SCALE):
-            raise ValueError(
-                f"teachers[{number}]: expected a model of {scene.path}, whose scale is {scene.scale:.6g}, "
-                f"got one of a scene of scale {scale:.6g}"
-            )
+        check_scale(f"teachers[{number}]", model, scene)
     return models
 
 

@@ -7,6 +7,7 @@ from functools import cached_property, partial, reduce
 from pathlib import Path
 
 import torch
+from typing_extensions import Unpack
 
 from nexwarp.data import Scene
 from nexwarp.errors import DivergedError, OutOfMemoryError, SceneError
@@ -15,11 +16,13 @@ from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, be
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.render import draw
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.checkpoint import Snapshot, load_checkpoint, save_checkpoint
 from nexwarp.train.densify import least_contributing
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.finish.finish import FinishObserver, finish_model
 from nexwarp.train.health import Health, oom_message, watched_tensors
+from nexwarp.train.initial import Start, check_start
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.schedules import OptimizerMaker, options_at, set_rates
@@ -54,6 +57,7 @@ class Trainer(TrainingState):
         optimizer: OptimizerMaker | None = None,
         teachers: Iterable[Model] = (),
         calibrate: Calibrate = calibrate_exposures,
+        **start: Unpack[Start],
     ) -> None:
         """Make the initial surfels and texture.
 
@@ -65,18 +69,20 @@ class Trainer(TrainingState):
             optimizer: makes an optimizer of the parameter groups; None is Adam.
             teachers: trained models of the scene, to learn from their renderings too.
             calibrate: estimates the photos' exposures.
+            start: `surfels`, `init` and `texture`, as for `nexwarp.train`.
 
         Raises:
             SceneError: the scene has no training views.
-            TypeError, ValueError: own losses, the optimizer or teachers do not fit.
+            TypeError, ValueError: own losses, the optimizer, teachers or what to start from do not fit.
         """
         if not scene.train:
             raise SceneError(f"{scene.path}: expected at least one training view, got none")
         device, self.own_losses = torch.device(device), check_own_losses(losses)
         models = check_teachers(teachers, scene, config)
+        check_start(scene, config, start)
         seed_everything(config.seed)
         calibration = calibrate(scene, config)
-        super().__init__(scene, config, device, None if calibration is None else calibration.colors, optimizer)
+        super().__init__(scene, config, device, None if calibration is None else calibration.colors, optimizer, start)
         self.exposures = None if calibration is None else calibration.exposures
         capture = config.cuda_graphs and device.type == "cuda" and can_capture(self.optimizer)
         self.graphs = StepGraphs(device) if capture else None
@@ -209,7 +215,8 @@ class Trainer(TrainingState):
         unneeded = None
         if self.densifier.relocates(self.iteration):
             unneeded = beside(self.graphs, self._unneeded)
-        self.densifier.step(self.optimizer, self.generator, unneeded)
+        along = [(self.texture, name) for name in self.texture.per_surfel]
+        self.densifier.step(self.optimizer, self.generator, unneeded, along)
 
     def _unneeded(self) -> torch.Tensor:
         cameras = self.views.refined_cameras(self.poses)
@@ -218,7 +225,8 @@ class Trainer(TrainingState):
     def _graph_key(self) -> GraphKey:
         tensors = [self.densifier.errors, *(parameter for _, parameter in self._named_parameters())]
         key = graph_key(self.render_options(), self.optimizer, tensors, densify=self.densifier.active(self.iteration))
-        return key._replace(kernels=(key.kernels, self.texture.half_copy_key()))
+        copy = self.texture.half_copy_key() if isinstance(self.texture, NeuralTexture) else None
+        return key._replace(kernels=(key.kernels, copy))
 
     def model(self) -> Model:
         """Return the model as it is now: the trainer's own surfels and texture, at the photos' mean exposure."""
@@ -226,13 +234,15 @@ class Trainer(TrainingState):
 
     def render_options(self) -> RenderOptions:
         """Return how the scene is rendered at this point of the run."""
-        return options_at(self.config, self.iteration, self.background, self.texture.sh_degree)
+        degree = self.texture.sh_degree if isinstance(self.texture, NeuralTexture) else 0
+        return options_at(self.config, self.iteration, self.background, degree)
 
     def finish(self, observe: FinishObserver = lambda *_: None) -> Model:
         """Return a finished model of new surfels and the trainer's texture: smooth SH, detail limits, exposures."""
         if self.graphs is not None:
             self.graphs.clear()  # frees their memory; later steps are captured anew
-        self.texture.drop_half_copy()
+        if isinstance(self.texture, NeuralTexture):
+            self.texture.drop_half_copy()
         with torch.autocast(self.device.type, enabled=False):
             cameras = self.views.refined_cameras(self.poses)
             return finish_model(self.model(), self.scene.train, cameras, self.exposures, self.config, observe)
@@ -247,8 +257,8 @@ class Trainer(TrainingState):
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write a checkpoint, the model as it is, and the cameras into a folder, which the commands open."""
         Path(folder).mkdir(parents=True, exist_ok=True)
+        self.model().save(folder)  # which refuses a texture that files cannot hold
         self.save_checkpoint(Path(folder))
-        self.model().save(folder)
         self.save_cameras(folder)
 
     def save_checkpoint(self, run: Path) -> None:

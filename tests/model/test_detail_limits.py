@@ -23,7 +23,7 @@ def textured_at(texture: nw.NeuralTexture, camera: nw.Camera, out: nw.Rendering,
     positions, directions = ops.unproject(out.depths, camera.viewmat, pinhole)
     filled = out.ids >= 0
     assert (out.depths[filled] < 3.4).any() and (out.depths[filled] > 3.6).any()
-    colors = texture.colors(positions, torch.where(filled, depths, 0.0), directions, camera.focal)
+    colors = texture.evaluate(positions, torch.where(filled, depths, 0.0), directions, camera.focal)
     return (out.weights[..., None] * colors).sum(2)
 
 

@@ -44,10 +44,10 @@ def test_textured_colors_agree_with_the_reference(
     references = torch.autograd.grad((expected * factors.double()).sum(), leaves)
 
     at, far = positions.clone().requires_grad_(), depths.clone().requires_grad_()
-    out = texture.colors(at, far, directions, 24.0, clamp=clamp)
+    out = texture.evaluate(at, far, directions, 24.0, clamp=clamp)
     grads = torch.autograd.grad((out * factors).sum(), [at, far, *texture.parameters()])
     with torch.no_grad():
-        assert torch.equal(texture.colors(positions, depths, directions, 24.0, clamp=clamp), out)
+        assert torch.equal(texture.evaluate(positions, depths, directions, 24.0, clamp=clamp), out)
     assert_close(out, expected, kind="value", name="colors")
     for index, (gradient, reference) in enumerate(zip(grads, references, strict=True)):
         assert_close(gradient, reference, kind="gradient", name=f"gradient {index}")
@@ -60,7 +60,7 @@ def test_what_is_not_a_number_reaches_the_colors(part: str) -> None:
     *hidden, last = texture.mlp.parameters()
     with torch.no_grad():
         {"grid": texture.grid, "hidden": hidden[1], "last": last}[part].fill_(torch.nan)
-    colors = texture.colors(torch.rand(5, 2, 3), torch.ones(5, 2), torch.tensor([[0.0, 0.0, 1.0]] * 5), 24.0)
+    colors = texture.evaluate(torch.rand(5, 2, 3), torch.ones(5, 2), torch.tensor([[0.0, 0.0, 1.0]] * 5), 24.0)
     assert colors.isnan().all()
     grads = torch.autograd.grad(colors.sum(), [texture.grid, hidden[0]])
     assert any(grad.isnan().any() for grad in grads)

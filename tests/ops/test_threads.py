@@ -106,7 +106,7 @@ def test_texture_does_not_depend_on_threads(turned):
         launch.set_num_threads(threads)
         inputs = {"positions": leaf(positions), "depths": leaf(depths), "directions": leaf(directions)}
         toward = inputs["directions"] if turned else inputs.pop("directions").detach()
-        out = texture.colors(inputs["positions"], inputs["depths"], toward, 24.0)
+        out = texture.evaluate(inputs["positions"], inputs["depths"], toward, 24.0)
         factors = torch.randn(out.shape, generator=torch.Generator().manual_seed(1))
         leaves = inputs | dict(texture.named_parameters())
         grads = torch.autograd.grad((out * factors).sum(), list(leaves.values()))

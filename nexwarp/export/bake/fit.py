@@ -51,7 +51,7 @@ def evaluate(model: Model, seen: Observations, layout: Layout) -> torch.Tensor:
         offsets = (local * surfels.scales[ids]).unbind(1)
         sides = axes(surfels)
         points = surfels.means[ids] + sum(x[:, None] * axis[ids] for x, axis in zip(offsets, sides, strict=True))
-        colors = model.texture.colors(
+        colors = model.texture.evaluate(
             points[:, None],
             sizes[ids, None],
             seen.directions[ids],
