@@ -22,6 +22,7 @@ from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import SettingError
 from nexwarp.io.json_files import Json
 from nexwarp.model.model_file import load
+from nexwarp.model.surfels import Surfels
 from nexwarp.run.folder import (
     RunRecord,
     check_teachers_place,
@@ -33,6 +34,7 @@ from nexwarp.run.folder import (
     update_run,
 )
 from nexwarp.run.log import check_tensorboard
+from nexwarp.train.initial import Start, check_start
 from nexwarp.train.ranks.launch import check_count, is_rank
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import DEMO_SETTINGS, Config, preset
@@ -41,6 +43,8 @@ from nexwarp.train.stages import NO_TEACHERS, StageRunner, plan_teachers, stage_
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
+
+PLY = ".ply"
 
 
 @dataclass
@@ -63,6 +67,8 @@ class Train:
         tyro.conf.arg(name="teacher", metavar="RUN", help_behavior_hint="(repeatable)"),
     ] = ()
     """Learn from a finished run, too."""
+    init: Annotated[Path | None, option("FILE|RUN", "the points")] = None
+    """Start from surfels of a .ply, or from a run."""
     preset: Preset_ = "default"
     """Start from default, web or paper."""
     settings: Annotated[
@@ -115,7 +121,12 @@ class Train:
         with ExitStack() as claim:
             record, resume = self._plan(run, ranks, claim, console)
             teachers = [load(path) for path in record.teachers]  # a wrong path is told before photos are read
+            start = _start(record.init, resume)
             scene = _load_scene(record, ranks, console)
+            try:
+                check_start(scene, record.config, start)
+            except ValueError as error:
+                raise SettingError(f"--init: {error}") from None
             if not resume:
                 config = self._with_background(record.config, scene)
                 own = NO_TEACHERS if teachers else plan_teachers(config, len(scene.train))
@@ -124,7 +135,7 @@ class Train:
                 run, record, console, ranks, resume=resume, tensorboard=self.tensorboard, every=self.checkpoint_every
             )
             runner = stage_runner(
-                scene, record.config, ranks.device, session, own=record.own, ranks=ranks, teachers=teachers
+                scene, record.config, ranks.device, session, own=record.own, ranks=ranks, teachers=teachers, **start
             )
             if ranks.first and resume:
                 _tell_extension(run, record.config, console)
@@ -172,9 +183,11 @@ class Train:
         for path in self.teachers:
             if path.resolve().is_relative_to(run.resolve()):
                 raise SettingError(f"--teacher: expected another run than {run}, which is written, got {path}")
+        if self.init is not None and self.init.resolve().is_relative_to(run.resolve()):
+            raise SettingError(f"--init: expected another run than {run}, which is written, got {self.init}")
         if self.teachers and config.refine_poses:
             raise SettingError("--teacher: expected poses that stay as given, got --refine-poses")
-        return RunRecord(self.scene, config, ranks.device.type, self.teachers)
+        return RunRecord(self.scene, config, ranks.device.type, self.teachers, init=self.init)
 
     def _config(self) -> Config:
         """Return the settings of a new run."""
@@ -231,6 +244,8 @@ class Train:
                 _check_same(_flag(name) if name in flags else f"--set: {name}", setting(config, name), value)
         if self.teachers and old.own.count:
             raise SettingError(f"--teacher: expected none, as the run to resume trains its own, got {self.teachers[0]}")
+        if self.init is not None:
+            _check_same("--init", old.init, self.init.resolve())
         source = dataclasses.replace(old.source, path=self.scene.path)
         return dataclasses.replace(old, source=source, config=config, teachers=self.teachers or old.teachers)
 
@@ -305,6 +320,13 @@ def _with_set(config: Config, settings: dict[str, Json]) -> Config:
         return with_settings(config, settings)
     except ValueError as error:
         raise SettingError(f"--set: {error}") from None
+
+
+def _start(path: Path | None, resume: bool) -> Start:
+    """Return what a run starts from; of one to resume, the checkpoint has the surfels, and only a texture counts."""
+    if path is None or (resume and path.suffix == PLY):
+        return {}
+    return {"surfels": Surfels.load(path)} if path.suffix == PLY else {"init": load(path)}
 
 
 def _load_scene(record: RunRecord, ranks: Ranks, console: Console) -> Scene:

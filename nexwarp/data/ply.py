@@ -44,11 +44,7 @@ def read_ply(path: Path) -> Cloud:
         FileNotFoundError: no such file.
         ValueError: the file is not PLY, is damaged or truncated, has no vertices, or positions that are not finite.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file, expected a PLY file of points")
-    with path.open("rb") as file:
-        form, elements = _header(path, file)
-        vertices = _vertices(path, file, form, elements)
+    vertices = read_vertices(path)
     lacking = [axis for axis in "xyz" if axis not in (vertices.dtype.names or ())]
     if lacking:
         raise ValueError(f"{path}: expected vertices with x, y and z, found no {lacking[0]}")
@@ -56,6 +52,15 @@ def read_ply(path: Path) -> Cloud:
         positions = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
         check_points(path, positions, "points", lambda index: f"vertex {index}")
         return Cloud.of(positions, _colors(vertices))
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """Return the vertices (P,) of a PLY file, P >= 1, with a field for each property; errors as of `read_ply`."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file, expected a PLY file of points")
+    with path.open("rb") as file:
+        form, elements = _header(path, file)
+        return _vertices(path, file, form, elements)
 
 
 def _header(path: Path, file: io.BufferedReader) -> tuple[str, list[Element]]:

@@ -1,17 +1,23 @@
 """The surfels: geometry and plain (non-textured) appearance (paper Sec. 4.1)."""
 
+import os
+from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import nn
 
 from nexwarp import ops
-from nexwarp.errors import check_finite, check_tensors
+from nexwarp.data.ply import read_vertices
+from nexwarp.errors import FormatError, check_finite, check_tensors
 from nexwarp.kernels.types import MAX_SH_DEGREE
+from nexwarp.model.bounds import check_bounds
 
 COEFFICIENTS = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))  # of SH degrees 0 to 3
 # Distance from the ends of the ranges, where raw values are infinite. Activated values change by at most 2e-6.
 END = 1e-6
+SOFT = -5.0  # raw gamma of kernels that are all but Gaussian, and that a training can still sharpen
 
 PARAMETERS = ("means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN")
 
@@ -122,6 +128,52 @@ class Surfels(nn.Module):
         }
         return cls({name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in raw.items()})
 
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "Surfels":
+        """Load surfels from a PLY file, float32 on the CPU: one of `nexwarp export`, or Gaussians of 3DGS.
+
+        A Gaussian becomes a surfel along its two largest axes, with a gamma of 1.007.
+
+        Args:
+            path: the file. Properties of its vertices: x, y, z; f_dc_* and f_rest_*; opacity, a logit; scale_*, two or
+                three logarithms; rot_*, wxyz; and gamma_*, log(gamma - 1), of surfels.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: the file is damaged, a property is missing, or its values are out of range.
+        """
+        file = Path(path)
+        vertices = read_vertices(file)
+        names = vertices.dtype.names or ()
+        for name in ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "rot_0"):
+            if name not in names:
+                raise FormatError(f"{file}: expected surfels, or Gaussians of 3DGS, found no property {name}")
+
+        def columns(*wanted: str) -> torch.Tensor:
+            return torch.from_numpy(np.stack([vertices[name].astype(np.float32) for name in wanted], axis=1))
+
+        def numbered(name: str) -> torch.Tensor:
+            count = sum(other.startswith(f"{name}_") for other in names)
+            return columns(*(f"{name}_{i}" for i in range(count))) if count else torch.zeros(len(vertices), 0)
+
+        try:
+            quats, scales, gammas, rest = (numbered(name) for name in ("rot", "scale", "gamma", "f_rest"))
+            if scales.shape[1] == 3:
+                quats, scales = _flattened(quats, scales)
+            raw = {
+                "means": columns("x", "y", "z"),
+                "raw_quats": quats,
+                "log_scales": scales,
+                "logit_opacities": columns("opacity")[:, 0],
+                "raw_gammas": gammas if gammas.shape[1] else torch.full((len(vertices), 2), SOFT),
+                "sh0": columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None],
+                "shN": rest.reshape(len(vertices), 3, -1).mT.contiguous(),
+            }
+            check_bounds({f"surfels.{name}": x for name, x in raw.items()})
+            return cls(raw)
+        except (ValueError, RuntimeError) as error:
+            raise FormatError(f"{file}: expected surfels, or Gaussians of 3DGS ({error})") from None
+
     def __len__(self) -> int:
         return self.means.shape[0]
 
@@ -165,6 +217,23 @@ class Surfels(nn.Module):
     def sh(self) -> torch.Tensor:
         """(N, C, 3) spherical harmonics of the plain colour, DC first."""
         return torch.cat([self.sh0, self.shN], dim=1)
+
+
+def _flattened(quats: torch.Tensor, log_scales: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the rotations (N, 4) and log scales (N, 2) of Gaussians whose smallest axis becomes the normal."""
+    smallest = log_scales.argmin(dim=1)
+    # The axes in cyclic order, the smallest one last; and the rotation that puts them there.
+    order = torch.tensor([[1, 2], [2, 0], [0, 1]])[smallest]
+    turns = torch.tensor([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]])
+    a, b, c, d = turns[smallest].unbind(-1)
+    w, x, y, z = quats.unbind(-1)
+    turned = [
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    ]
+    return torch.stack(turned, dim=-1), log_scales.gather(1, order)
 
 
 def check_coefficients(name: str, count: int) -> None:

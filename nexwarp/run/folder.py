@@ -109,6 +109,7 @@ class RunRecord:
     device: str = "cpu"  # type of the device on which the run began
     teachers: tuple[Path, ...] = ()  # folders or files of finished models that the run also learns from
     own: OwnTeachers = NO_TEACHERS  # teachers that the run trains first
+    init: Path | None = None  # surfels, or a model, that the run starts from
 
     def as_dict(self) -> dict[str, Json]:
         """Return the entries of config.json; paths are absolute."""
@@ -116,6 +117,8 @@ class RunRecord:
         data["config"] = self.config.as_dict()
         if self.teachers:
             data["teachers"] = [str(path.resolve()) for path in self.teachers]
+        if self.init is not None:
+            data["init"] = str(self.init.resolve())
         if self.own.count:
             data["own_teachers"] = dataclasses.asdict(self.own)
         return data
@@ -131,7 +134,10 @@ class RunRecord:
         config, own = config_from_dict(data["config"]), _own_teachers(data.get("own_teachers"))
         if own.count * own.iterations >= config.iterations:
             raise ValueError(f"own_teachers: expected fewer iterations than the run's {config.iterations}, got {own}")
-        return cls(source, config, str(data.get("device", "cpu")), tuple(map(Path, teachers)), own)
+        if (init := data.get("init")) is not None and not isinstance(init, str):
+            raise ValueError(f"init: expected a path, got {init!r:.60}")
+        start = None if init is None else Path(init)
+        return cls(source, config, str(data.get("device", "cpu")), tuple(map(Path, teachers)), own, start)
 
 
 def _own_teachers(data: object) -> OwnTeachers:

@@ -15,12 +15,11 @@ from nexwarp.kernels.sh import BAND_0
 from nexwarp.model.bounds import check_bounds
 from nexwarp.model.model import Model
 from nexwarp.model.poses import PoseCorrections
-from nexwarp.model.surfels import Surfels
+from nexwarp.model.surfels import SOFT, Surfels
 from nexwarp.model.texture import NeuralTexture, Texture, TextureShape
 from nexwarp.train.recipe import Config
 
 INITIAL_OPACITY = 0.1
-INITIAL_RAW_GAMMA = -5.0
 NUMBERS_A_PIXEL = 0.1  # of the hash grid, for each pixel of the training photos
 USUAL_SCALE = 5.0  # world units; fox, saharov and kitchen25 have 4.4 to 5.0 as COLMAP left them
 SKYBOX_SHARE = 6  # at most one initial surfel of so many lies on the sphere
@@ -116,7 +115,7 @@ def initial_surfels(
         "raw_quats": quats_towards(points.normals, quats) if config.orient_points else quats,
         "log_scales": points.scales.log()[:, None].repeat(1, 2),
         "logit_opacities": torch.logit(torch.full((count,), INITIAL_OPACITY)),
-        "raw_gammas": torch.full((count, 2), INITIAL_RAW_GAMMA),
+        "raw_gammas": torch.full((count, 2), SOFT),
         "sh0": ((points.colors - 0.5) / BAND_0)[:, None],
         "shN": torch.zeros(count, (config.sh_degree + 1) ** 2 - 1, 3),
     }
