@@ -69,6 +69,8 @@ class Exposures(nn.Module):
             raise ValueError(f"exposures: expected {missing[0]}, found none")
         buffers = {"falloff": buffers["lengths"].new_tensor(EVEN), **buffers}
         check_tensors({name: (buffers[name], shape) for name, shape in SHAPES.items()})
+        if not 1 <= (count := len(buffers["log_gains"])) <= MOST_PHOTOS:
+            raise ValueError(f"exposures: expected 1 to {MOST_PHOTOS:,} photos, got {count:,}")
         for name in SHAPES:
             self.register_buffer(name, buffers[name])
         self._read_falloff()

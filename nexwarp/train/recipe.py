@@ -6,9 +6,11 @@ schedules stretch with `Config.iterations`.
 """
 
 import dataclasses
+import json
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 from nexwarp.errors import check_range
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
@@ -21,6 +23,41 @@ MIN_SURFELS = 16
 MASK_MODES = ("ignore", "background")
 MOST_TEACHERS = 8
 MIN_STRENGTH, MAX_STRENGTH = 1e-6, 1e6  # of SH smoothing; 0 is allowed too, less is lost in the harmonics' rounding
+
+LARGEST_NUMBER = 2**53  # all integers up to there are floats too
+KINDS: dict[object, str] = {
+    int: "an integer",
+    float: "a number",
+    bool: "true or false",
+    str: "text",
+    type(None): "null",
+}
+
+
+def typed(name: str, value: object, annotation: object) -> object:
+    """Return a value as its annotation has it, int where float is meant and list for tuple will do; or ValueError."""
+    options = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
+    number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
+    for option in options:
+        if get_origin(option) is tuple:
+            kinds = get_args(option)
+            if isinstance(value, (list, tuple)) and len(value) == len(kinds):
+                return tuple(typed(name, x, kind) for x, kind in zip(value, kinds, strict=True))
+        elif option in (int, float):
+            if number and (option is float or isinstance(value, int)):
+                return option(value)
+        elif type(value) is option:
+            return value
+    names = (getattr(x, "__name__", "") if dataclasses.is_dataclass(x) else KINDS.get(x) for x in options)
+    lengths = (f"a list of {len(get_args(x))} numbers" for x in options)
+    expected = " or ".join(name or length for name, length in zip(names, lengths, strict=True))
+    raise ValueError(f"{name}: expected {expected}, got {json.dumps(value, default=repr)[:60]}")
+
+
+def _check_types(settings: object) -> None:
+    """Give each field of a dataclass the type of its annotation; ValueError names a field that has another."""
+    for name, annotation in get_type_hints(type(settings)).items():
+        object.__setattr__(settings, name, typed(name, getattr(settings, name), annotation))
 
 
 @dataclass(frozen=True)
@@ -46,6 +83,7 @@ class LossWeights:
     Counts from 7/30 of the run on; smoother meshes."""
 
     def __post_init__(self) -> None:
+        _check_types(self)
         check_range("dssim", self.dssim, 0.0, 1.0)
         for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "normals"):
             check_range(name, getattr(self, name), 0.0)
@@ -75,6 +113,7 @@ class LearningRates:
     """First and last learning rate of the MLP."""
 
     def __post_init__(self) -> None:
+        _check_types(self)
         for rate in dataclasses.fields(self):
             value = getattr(self, rate.name)
             ends = value if isinstance(value, tuple) else (value, value)
@@ -109,6 +148,7 @@ class TextureConfig:
     """Fade levels whose cells are smaller than a pixel (paper Eq. 4)."""
 
     def __post_init__(self) -> None:
+        _check_types(self)
         entries = 1 if self.table_size is None else self.table_size
         degree = 0 if self.sh_degree is None else self.sh_degree
         check_sizes(self.levels, entries, self.features, self.width, self.hidden_layers, degree)
@@ -135,6 +175,7 @@ class DensifyConfig:
     that contribute least to the training views. Others are split in their place. 0 removes none."""
 
     def __post_init__(self) -> None:
+        _check_types(self)
         check_range("every", self.every, 1)
         check_range("fraction", self.fraction, 0.0, 1.0)
         check_range("prune_opacity", self.prune_opacity, 0.0, 1.0)
@@ -171,6 +212,7 @@ class Recipe:
     """Density control."""
 
     def __post_init__(self) -> None:
+        _check_types(self)
         check_range("more_hits_from", self.more_hits_from, 0)
         check_range("sh_every", self.sh_every, 1)
         check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)

@@ -4,26 +4,17 @@ import dataclasses
 import json
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
-from types import UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
-from nexwarp.train.recipe import DEFAULT, PRESETS, Config
+from nexwarp.train.recipe import DEFAULT, PRESETS, Config, typed
 
-LARGEST_NUMBER = 2**53  # all integers up to there are floats too
 PARTS = [field.name for field in dataclasses.fields(Config) if dataclasses.is_dataclass(getattr(DEFAULT, field.name))]
 # What runs did before a setting existed, where the default does something else.
 BEFORE: dict[str, object] = {"skybox": 0, "teachers": 0, "densify.relocate": 0.0}
 # Settings that no version has any more, and the value with which they did nothing.
 REMOVED: dict[str, object] = {"blur_poses": 1, "coarse": 0.0, "low_pass": False, "losses.distortion": 0.0}
-KINDS: dict[object, str] = {
-    int: "an integer",
-    float: "a number",
-    bool: "true or false",
-    str: "text",
-    type(None): "null",
-}
 
 
 def setting_names() -> list[str]:
@@ -49,14 +40,14 @@ def with_settings(config: Config, settings: Mapping[str, object]) -> Config:
         _check_name(name)
         part, _, key = name.rpartition(".")
         hints = get_type_hints(type(getattr(config, part) if part else config))
-        changes.setdefault(part, {})[key] = _typed(name, value, hints[key])
+        changes.setdefault(part, {})[key] = typed(name, value, hints[key])
     whole = changes.pop("", {})
     for part, values in changes.items():
         try:
             whole[part] = dataclasses.replace(getattr(config, part), **values)
         except ValueError as error:  # which names the setting without the part
             raise ValueError(f"{part}.{error}") from None
-    return dataclasses.replace(config, **whole)  # type: ignore[arg-type]  # _typed has checked them
+    return dataclasses.replace(config, **whole)  # type: ignore[arg-type]  # typed has checked them
 
 
 def parse_settings(texts: Iterable[str]) -> dict[str, Json]:
@@ -121,21 +112,3 @@ def _check_name(name: str) -> None:
     if name not in known:
         close = get_close_matches(name, known, n=4, cutoff=0.5) or known[:4]
         raise ValueError(f"{one_line(name, 60)}: expected a setting, such as {', '.join(close)}")
-
-
-def _typed(name: str, value: object, annotation: object) -> object:
-    """Return a value as its annotation has it: int where float is meant and list for tuple will do."""
-    options = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
-    number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
-    for option in options:
-        if get_origin(option) is tuple:
-            kinds = get_args(option)
-            if isinstance(value, (list, tuple)) and len(value) == len(kinds):
-                return tuple(_typed(name, x, kind) for x, kind in zip(value, kinds, strict=True))
-        elif option in (int, float):
-            if number and (option is float or isinstance(value, int)):
-                return option(value)
-        elif type(value) is option:
-            return value
-    expected = " or ".join(KINDS.get(x, f"a list of {len(get_args(x))} numbers") for x in options)
-    raise ValueError(f"{name}: expected {expected}, got {json.dumps(value, default=repr)[:60]}")

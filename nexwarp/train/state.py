@@ -28,6 +28,8 @@ from nexwarp.train.schedules import OptimizerMaker, make_optimizer
 from nexwarp.train.settings import config_from_dict, refuse_removed
 
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
+CPU_GENERATOR = 5056  # bytes of the state of a generator on a CPU, a Mersenne twister
+TWISTER = 624  # numbers that it makes at a time
 FLOATS = ("surfels.", "texture.", "own_texture.", "poses.", "adam.", "densify.")  # of tensors that are float32
 
 
@@ -265,11 +267,23 @@ def check_snapshot(snapshot: Snapshot, views: int, iterations: int) -> None:
             if x.dtype != torch.float32:
                 raise ValueError(f"{name}: expected float32, got {x.dtype}")
             check_finite(name, x)
+        if name.startswith("rng.") and x.numel() == CPU_GENERATOR:
+            check_generator(name, x)
+    if not len(tensors["surfels.means"]):
+        raise ValueError("surfels.means: expected at least one surfel, got none")
     check_bounds(tensors)
     if not (type(state["iteration"]) is int and 0 <= state["iteration"] <= iterations):
         raise ValueError(f"iteration: cannot be {state['iteration']!r:.60}")
     if not set(state["order"]) <= set(range(views)):
         raise ValueError(f"order: cannot be {state['order']!r:.60}")
+
+
+def check_generator(name: str, state: torch.Tensor) -> None:
+    """Raise ValueError unless a CPU generator's position lies in its numbers; torch would read what is behind them."""
+    content = state.numpy().tobytes()
+    left, position = int.from_bytes(content[8:12], "little", signed=True), int.from_bytes(content[16:24], "little")
+    if not (left >= 1 and left + position <= TWISTER + 1):
+        raise ValueError(f"{name}: expected a position in {TWISTER} numbers, got {position} with {left} left")
 
 
 def scene_digest(scene: Scene, texture: Texture) -> str:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -373,3 +374,27 @@ def test_no_exposures_where_none_are_wanted(tmp_path, change):
     plain = dataclasses.replace(config, exposures=True, mask_mode="ignore")
     assert Trainer(known, plain, "cpu").finish().exposures is None
     assert Trainer(scene, plain, "cpu").finish().exposures is not None
+
+
+def make_exposures(count: int, **changes: torch.Tensor) -> Exposures:
+    values = {name: torch.zeros(count, 3) for name in ("log_gains", "positions", "directions", "coefficients")}
+    return Exposures(values | {"mean": torch.zeros(3), "lengths": torch.ones(2)} | changes)
+
+
+def test_predicted_gains_stay_within_those_of_the_photos() -> None:
+    gains = torch.tensor([[-0.2, -0.1, 0.0], [0.1, 0.2, 0.3]])
+    for sign, end in ((9.0, gains[1]), (-9.0, gains[0])):
+        exposures = make_exposures(2, log_gains=gains, coefficients=torch.full((2, 3), sign))
+        assert_close(exposures.gains(looking(0.0)), end.exp(), kind="value", name="gains")
+
+
+@pytest.mark.parametrize("count", [0, 1001])
+def test_exposures_of_too_few_and_too_many_photos_are_refused(tmp_path: Path, count: int) -> None:
+    """In files, too: `Exposures` is what reads them."""
+    with pytest.raises(ValueError, match=f"exposures: expected 1 to 1,000 photos, got {count:,}"):
+        make_exposures(count)
+    model = Model(make_surfels(random_scene(3)), None, make_exposures(2))
+    for name in ("log_gains", "positions", "directions", "coefficients"):
+        setattr(model.exposures, name, torch.zeros(count, 3))
+    with pytest.raises(ValueError, match="expected 1 to 1,000 photos"):
+        nw.load(model.save(tmp_path))

@@ -64,6 +64,19 @@ def test_steps_are_those_of_torch(device: torch.device) -> None:
         assert optimizer.state[parameter]["step"] == 30
 
 
+def test_epsilon_is_added_after_the_bias_correction(device: torch.device) -> None:
+    """With gradients as small as epsilon, which early steps would otherwise see hundreds of times smaller."""
+    ours = torch.nn.Parameter(torch.ones(5, device=device))
+    theirs = torch.nn.Parameter(ours.detach().double())
+    optimizer, reference = FusedAdam([{"params": [ours], "lr": 0.1}], eps=0.1), torch.optim.Adam([theirs], 0.1, eps=0.1)
+    for _ in range(3):
+        ours.grad = 0.1 * torch.rand_like(ours)
+        theirs.grad = ours.grad.double()
+        optimizer.step()
+        reference.step()
+    assert_close(ours, theirs, kind="value", name="parameter")
+
+
 def test_half_copy_is_the_grid(device: torch.device) -> None:
     texture, parameters = make_parameters(device)
     optimizer = make_optimizer(FusedAdam, parameters)

@@ -9,11 +9,14 @@ from typing import Any
 import pytest
 import torch
 
+from nexwarp.data import Scene
 from nexwarp.io.files import write_atomically
 from nexwarp.run.folder import remove_leftovers
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, has_checkpoint, load_checkpoint, save_checkpoint
+from nexwarp.train.trainer import Trainer
 from tests.faults import Killed, kill_at
 from tests.model_file_support import refused
+from tests.trainer_support import small
 
 
 @pytest.mark.parametrize("stage", ["write", "rename"])
@@ -129,3 +132,23 @@ def test_every_flipped_bit_and_every_length_is_found(tmp_path, name):
 
 def test_no_checkpoint(tmp_path):
     refused(FileNotFoundError, load_checkpoint, tmp_path, names=tmp_path, match="expected a checkpoint to resume from")
+
+
+def test_a_state_that_no_training_can_have_is_refused(tiny_scene: Scene, tmp_path: Path) -> None:
+    """No surfels; and generators whose next number would lie behind their numbers, which torch does not check."""
+    trainer = Trainer(tiny_scene, small(), "cpu")
+    trainer.run(until=2)
+    snapshot = trainer.snapshot()
+    empty = {name: x[:0] for name, x in snapshot.tensors.items() if name.startswith("surfels.")}
+    changes: list[tuple[dict[str, torch.Tensor], str]] = [(empty, "at least one surfel")]
+    for name in ("rng.views", "rng.noise", "rng.torch"):
+        state = snapshot.tensors[name].clone()
+        state[8:12] = torch.tensor([112, 2, 0, 0])  # 624 numbers left
+        state[16:24] = torch.tensor([112, 2, 0, 0, 0, 0, 0, 0])  # behind the 624th one
+        changes.append(({name: state}, f"{name}: expected a position in 624 numbers, got 624 with 624 left"))
+    for change, message in changes:
+        save_checkpoint(tmp_path, snapshot.tensors | change, snapshot.state)
+        with pytest.raises(ValueError, match=message):
+            trainer.restore(tmp_path)
+    save_checkpoint(tmp_path, *snapshot)
+    trainer.restore(tmp_path)

@@ -65,6 +65,21 @@ def short_config() -> Config:
     return small(iterations=24)
 
 
+def test_an_incomplete_last_step_is_the_mean_of_its_views(scene: Scene, tmp_path: Path) -> None:
+    """Of 5 views, 3 ranks render 3, then 2: the third one repeats a view with weight 0."""
+
+    def work(ranks: Ranks) -> object:
+        trainer = ParallelTrainer(scene, small(iterations=5), CPU, ranks)
+        shares = []
+        while trainer.iteration < 5:
+            views = trainer.step().views
+            shares.append((views, trainer.share))
+        return shares
+
+    rendered = run_ranks(3, work, tmp_path)
+    assert rendered == [[[3, 1 / 3], [2, 1 / 2]]] * 2 + [[[3, 1 / 3], [2, 0.0]]]
+
+
 @pytest.mark.parametrize(
     ("size", "steps"), [(2, 200), (3, 60), pytest.param(3, 200, marks=pytest.mark.slow)], ids=["2", "3", "3 for long"]
 )

@@ -247,3 +247,18 @@ def test_the_demo_keeps_what_makes_a_preset():
     for name in ("texture.residual", "texture.max_resolution", "losses.depth", "densify.prune_at_cap", "smooth_sh"):
         assert setting(config, name) == setting(paper, name)
     assert dataclasses.replace(train, preset="default")._config().texture.residual
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "message"),
+    [
+        (Config, {"iterations": "x"}, 'iterations: expected an integer, got "x"'),
+        (Config, {"background": (0.0, 1.0)}, "background: expected a list of 3 numbers or null"),
+        (Config, {"densify": {}}, "densify: expected DensifyConfig"),
+        (LearningRates, {"means": 1.0}, "means: expected a list of 2 numbers"),
+        (TextureConfig, {"residual": 1}, "residual: expected true or false"),
+    ],
+)
+def test_a_value_of_another_type_names_its_field(kind: type, changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        kind(**changes)
