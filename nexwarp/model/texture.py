@@ -273,7 +273,7 @@ class NeuralTexture(Texture):
         return out.T.reshape(*depths.shape, (self.sh_degree + 1) ** 2, 3)
 
     def colors(
-        self, hits: Hits, camera: Camera | RayCamera, *, sh_degree: int = MAX_SH_DEGREE, clamp: bool = False
+        self, hits: Hits, camera: Camera | RayCamera, *, sh_degree: int = 3, clamp: bool = False
     ) -> torch.Tensor:
         """Return the colours (H, W, K, 3) of hits; see `evaluate`. A subclass takes both keywords, too."""
         return self.evaluate(hits.points, hits.depths, hits.directions, camera.focal, sh_degree=sh_degree, clamp=clamp)
