@@ -18,7 +18,7 @@ from nexwarp.run.fit_poses import fit_poses
 from nexwarp.train import recipe
 from nexwarp.train.initial import initial_poses
 from nexwarp.train.recipe import DEMO_SETTINGS, DensifyConfig, LearningRates, preset
-from nexwarp.train.schedules import make_optimizer, rate_ends
+from nexwarp.train.schedules import rate_ends
 from nexwarp.train.settings import with_settings
 from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import with_cameras
@@ -146,10 +146,7 @@ def test_disturbed_poses_come_back_in_training(shown, model):
     given.keep_gauge()
     true = [view.camera for view in shown.train]
     wrong = dataclasses.replace(shown, train=with_cameras(shown.train, given.cameras(true)))
-    trainer = Trainer(wrong, config, "cpu")
-    trainer.surfels = nw.Surfels({name: x.clone() for name, x in model.surfels.state_dict().items()})
-    trainer.optimizer = make_optimizer(trainer.surfels, trainer.texture, config, shown.scale, poses=trainer.poses)
-    trainer.densifier.errors = torch.zeros(len(trainer.surfels))
+    trainer = Trainer(wrong, config, "cpu", surfels=model.surfels)
     before = pose_differences(poses_of(trainer.views.refined_cameras(trainer.poses)), poses_of(true))
     trainer.run()
     after = pose_differences(poses_of(trainer.views.refined_cameras(trainer.poses)), poses_of(true))
