@@ -6,17 +6,22 @@ python examples/depth_and_normals.py --model runs/demo --out runs/demo/geometry
 import argparse
 from pathlib import Path
 
+import numpy as np
 import torch
+from PIL import Image
 
 import nexwarp as nw
-from nexwarp.cameras.cameras_file import load_cameras
-from nexwarp.io.pictures import save_exr, save_png
 
 
 def grey(depth: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
     """Picture (H, W, 3) of a depth (H, W): near is white, far is dark, nothing is black."""
     inverse = torch.where(mask, 1.0 / depth.clamp_min(1e-6), 0.0)
     return (inverse / inverse.max().clamp_min(1e-6))[..., None].expand(-1, -1, 3)
+
+
+def save(path: Path, picture: torch.Tensor) -> None:
+    """Write values from 0 to 1 (H, W, 3) as a picture."""
+    Image.fromarray((255 * picture.clamp(0, 1)).round().byte().cpu().numpy()).save(path)
 
 
 def main() -> None:
@@ -28,26 +33,25 @@ def main() -> None:
     parser.add_argument("--opaque", type=float, default=0.5, help="alpha from which on a pixel belongs to the scene")
     args = parser.parse_args()
     model = nw.load(args.model).to("cuda" if torch.cuda.is_available() else "cpu")
-    sets = load_cameras(Path(args.model) / "cameras.json")
+    sets = nw.load_cameras(Path(args.model) / "cameras.json")
     cameras = sets["test"] | sets["train"]
     with torch.no_grad():
         rendering = model.render(cameras[args.view or next(iter(cameras))])
     mask = rendering.alpha >= args.opaque
     out = Path(args.out)
-    save_png(out / "image.png", rendering.image.clamp(0, 1))
-    save_png(out / "mask.png", mask[..., None].expand(-1, -1, 3).float())
-    save_png(out / "expected_depth.png", grey(rendering.expected_depth, mask))
-    save_png(out / "median_depth.png", grey(rendering.median_depth, mask))
-    save_png(out / "normals.png", (rendering.normals + 1.0) / 2.0 * mask[..., None])  # x, y, z as red, green, blue
-    save_exr(
-        out / "geometry.exr",  # z-depths in world units, normals in the world frame, float32
-        {
-            "expected_depth": rendering.expected_depth,
-            "median_depth": rendering.median_depth,
-            "normals": rendering.normals,
-            "alpha": rendering.alpha,
-        },
-    )
+    out.mkdir(parents=True, exist_ok=True)
+    save(out / "image.png", rendering.image)
+    save(out / "mask.png", mask[..., None].expand(-1, -1, 3).float())
+    save(out / "expected_depth.png", grey(rendering.expected_depth, mask))
+    save(out / "median_depth.png", grey(rendering.median_depth, mask))
+    save(out / "normals.png", (rendering.normals + 1.0) / 2.0 * mask[..., None])  # x, y, z as red, green, blue
+    names = (
+        "expected_depth",
+        "median_depth",
+        "normals",
+        "alpha",
+    )  # z-depths, world units; normals, world frame; float32
+    np.savez(out / "geometry.npz", **{name: getattr(rendering, name).cpu().numpy() for name in names})
     print(f"{100 * mask.float().mean().item():.1f} % of the pixels are opaque; files in {out}")
 
 

@@ -6,12 +6,11 @@ python examples/own_loss.py --steps 500 --weight 0.5 --optimizer radam
 import argparse
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import torch
 
 import nexwarp as nw
-from nexwarp.data import demo_folder
-from nexwarp.train.schedules import ParameterGroup
 
 
 def edge_loss(weight: float) -> Callable[[nw.Rendering, nw.Target], torch.Tensor]:
@@ -24,7 +23,7 @@ def edge_loss(weight: float) -> Callable[[nw.Rendering, nw.Target], torch.Tensor
     return loss
 
 
-def make_radam(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
+def make_radam(groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
     """RAdam; each group has `params`, `name` and `lr`, and the schedule goes on to drive `lr`."""
     return torch.optim.RAdam(groups, eps=1e-15)
 
@@ -37,7 +36,7 @@ def main() -> None:
     parser.add_argument("--downscale", type=int, default=4, help="reduce the demo's photos of 96x72 by this factor")
     parser.add_argument("--optimizer", choices=("adam", "radam"), default="adam")
     args = parser.parse_args()
-    demo = nw.load_scene(demo_folder(), downscale=args.downscale)
+    demo = nw.load_scene("demo", downscale=args.downscale)
     config = dataclasses.replace(nw.preset("default"), iterations=args.steps, max_surfels=2000)
     reports: list[tuple[float, float]] = []
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import torch
 
 import nexwarp as nw
-from nexwarp.cameras.cameras_file import load_cameras
 
 
 def moved(viewmat: torch.Tensor, rotation: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
@@ -34,7 +33,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200)
     args = parser.parse_args()
     model = nw.load(args.model).to("cuda" if torch.cuda.is_available() else "cpu")
-    camera = next(iter(load_cameras(Path(args.model) / "cameras.json")["train"].values())).to(model.device)
+    camera = next(iter(nw.load_cameras(Path(args.model) / "cameras.json")["train"].values())).to(model.device)
     photo = model.render(camera).image.detach()
     torch.manual_seed(0)
     size = torch.tensor([0.03, 0.03 * (model.surfels.means.detach().std())], device=model.device)

@@ -6,16 +6,26 @@ python examples/render_path.py --model runs/demo --out runs/demo/around --frames
 
 import argparse
 import dataclasses
+from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import torch
+from PIL import Image
 
 import nexwarp as nw
-from nexwarp.cameras.camera import resized
-from nexwarp.cameras.cameras_file import load_cameras
-from nexwarp.cameras.paths import ellipse
-from nexwarp.io.pictures import save_png, to_uint8
-from nexwarp.io.video import video_writer
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray], width: int, height: int) -> None:
+    """Write frames (H, W, 3) of 8 bits as H.264, which takes even sizes."""
+    import av
+
+    with av.open(str(path), "w") as video:
+        stream = video.add_stream("libx264", rate=30, options={"crf": "18"})
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        for frame in frames:
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(frame)))
+        video.mux(stream.encode(None))
 
 
 def main() -> None:
@@ -30,20 +40,21 @@ def main() -> None:
     model = nw.load(args.model).to("cuda" if torch.cuda.is_available() else "cpu")
     if args.white:
         model.options = dataclasses.replace(model.options, background=(1.0, 1.0, 1.0))
-    path = ellipse(list(load_cameras(Path(args.model) / "cameras.json")["train"].values()), args.frames)
-    height = args.height or path[0].height
-    width = round(path[0].width * height / path[0].height)
-    cameras = [resized(camera, width, height) for camera in path]
+    path = nw.ellipse(list(nw.load_cameras(Path(args.model) / "cameras.json")["train"].values()), args.frames)
+    scale = args.height / path[0].height if args.height else 1.0
+    width, height = round(scale * path[0].width), round(scale * path[0].height)
+    K = path[0].K * torch.tensor([[scale], [scale], [1.0]])
     out = Path(args.out)
     with torch.no_grad():
+        pictures = (model.render(nw.Camera(camera.viewmat, K, width, height, camera.near)).image for camera in path)
+        frames = ((255 * x.clamp(0, 1)).round().byte().cpu().numpy() for x in pictures)
         if out.suffix == ".mp4":
-            with video_writer(out, width, height, fps=30.0) as append:
-                for camera in cameras:
-                    append(to_uint8(model.render(camera).image))
+            write_video(out, frames, width, height)
         else:
-            for index, camera in enumerate(cameras):
-                save_png(out / f"frame_{index:04d}.png", model.render(camera).image)
-    print(f"{len(cameras)} frames of {width}x{height} in {out}")
+            out.mkdir(parents=True, exist_ok=True)
+            for index, frame in enumerate(frames):
+                Image.fromarray(frame).save(out / f"frame_{index:04d}.png")
+    print(f"{len(path)} frames of {width}x{height} in {out}")
 
 
 if __name__ == "__main__":

@@ -9,12 +9,11 @@ import dataclasses
 import torch
 
 import nexwarp as nw
-from nexwarp.data import demo_folder
 
 
 def scene_in_memory(downscale: int) -> nw.Scene:
     """Replace this by your own data; here, the photos, cameras and points of the built-in demo stand for it."""
-    demo = nw.load_scene(demo_folder(), downscale=downscale)
+    demo = nw.load_scene("demo", downscale=downscale)
     views = demo.train + demo.test
     return nw.Scene.from_tensors(
         images=[view.image.float() / 255.0 for view in views],  # (H, W, 3) in [0, 1]; uint8 and numpy are fine, too

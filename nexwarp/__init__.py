@@ -30,6 +30,7 @@ if "RANK" in os.environ:
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras
+from nexwarp.cameras.paths import ellipse
 from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.cli import __version__ as __version__
 from nexwarp.data import Scene, View, load_scene
@@ -70,6 +71,7 @@ __all__ = [
     "Trainer",
     "View",
     "compose",
+    "ellipse",
     "load",
     "load_cameras",
     "load_scene",
