@@ -45,12 +45,8 @@ def main() -> None:
     save(out / "expected_depth.png", grey(rendering.expected_depth, mask))
     save(out / "median_depth.png", grey(rendering.median_depth, mask))
     save(out / "normals.png", (rendering.normals + 1.0) / 2.0 * mask[..., None])  # x, y, z as red, green, blue
-    names = (
-        "expected_depth",
-        "median_depth",
-        "normals",
-        "alpha",
-    )  # z-depths, world units; normals, world frame; float32
+    # Float32: z-depths in world units, normals in the world frame.
+    names = ("expected_depth", "median_depth", "normals", "alpha")
     np.savez(out / "geometry.npz", **{name: getattr(rendering, name).cpu().numpy() for name in names})
     print(f"{100 * mask.float().mean().item():.1f} % of the pixels are opaque; files in {out}")
 

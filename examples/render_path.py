@@ -1,7 +1,6 @@
 """Render a camera path around a model, as PNG frames or, with PyAV, as a video.
 
 python examples/render_path.py --model runs/demo --out runs/demo/around.mp4 --frames 120
-python examples/render_path.py --model runs/demo --out runs/demo/around --frames 12
 """
 
 import argparse
@@ -50,10 +49,9 @@ def main() -> None:
         frames = ((255 * x.clamp(0, 1)).round().byte().cpu().numpy() for x in pictures)
         if out.suffix == ".mp4":
             write_video(out, frames, width, height)
-        else:
+        for index, frame in enumerate(frames):  # none is left where there is a video
             out.mkdir(parents=True, exist_ok=True)
-            for index, frame in enumerate(frames):
-                Image.fromarray(frame).save(out / f"frame_{index:04d}.png")
+            Image.fromarray(frame).save(out / f"frame_{index:04d}.png")
     print(f"{len(path)} frames of {width}x{height} in {out}")
 
 

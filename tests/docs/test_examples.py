@@ -1,5 +1,6 @@
 """The examples: each runs in its short form, shows what it is meant to show, and is short."""
 
+import ast
 import importlib.util
 import os
 import re
@@ -7,13 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.data import Scene
-from nexwarp.io.pictures import load_exr
 from nexwarp.train.recipe import LearningRates, TextureConfig
 from tests.subprocesses import python_path
 
@@ -65,6 +66,19 @@ def test_examples_are_short_and_tell_how_to_run_them(path: Path) -> None:
     assert f"\npython examples/{path.name} " in text.split('"""')[1]
 
 
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_import_the_public_face_alone(path: Path) -> None:
+    """What users copy is what `nexwarp.__all__` promises, not the package's rooms."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    modules = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    modules += [name.name for node in ast.walk(tree) if isinstance(node, ast.Import) for name in node.names]
+    names = {
+        node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "nw"
+    }
+    assert not [module for module in modules if module.startswith("nexwarp.")]
+    assert names <= {*nw.__all__, "tape"}
+
+
 def test_training_from_tensors_raises_the_psnr(tmp_path: Path) -> None:
     out = run("train_from_tensors", "--steps", 60, "--downscale", 4, "--out", tmp_path)
     steps = numbers(r"step \d+: ([\d.]+) dB", out)
@@ -91,9 +105,10 @@ def test_depth_and_normals_are_those_of_the_rendering(model: Path, tmp_path: Pat
     camera = tiny_scene.test[0].camera
     with torch.no_grad():
         rendering = nw.load(model).render(camera)
-    parts, _ = load_exr(tmp_path / "geometry.exr")
-    for name in ("expected_depth", "median_depth", "normals", "alpha"):
-        assert torch.equal(parts[name], getattr(rendering, name)), name
+    with np.load(tmp_path / "geometry.npz") as parts:
+        assert set(parts) == {"expected_depth", "median_depth", "normals", "alpha"}
+        for name, values in parts.items():
+            assert torch.equal(torch.from_numpy(values), getattr(rendering, name)), name
     names = {path.name for path in tmp_path.glob("*.png")}
     assert names == {"image.png", "mask.png", "expected_depth.png", "median_depth.png", "normals.png"}
     assert all(size_of(tmp_path / name) == (camera.width, camera.height) for name in names)
