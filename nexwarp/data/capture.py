@@ -99,6 +99,7 @@ class Capture:
     def of(cls, source: Path, photos: list[Photo], cloud: Cloud | None, **more: Any) -> "Capture":
         """Sort photos by name, and move photos and cloud from the world frame to one near them where that is needed."""
         photos = sorted(photos, key=lambda photo: photo.name)
+        cloud = cloud if cloud is not None and len(cloud.positions) else None
         largest = max((max(photo.lens.width, photo.lens.height) for photo in photos), default=0)
         origin = far_origin([photo.viewmat for photo in photos], largest, cloud)
         if origin.any():

@@ -23,13 +23,14 @@ from nexwarp.data.colmap_files import (
     PointRecords,
     Records,
     count_images,
-    read_binary,
-    read_text,
+    read_records,
 )
 from nexwarp.data.lens import Lens
+from nexwarp.data.ply import read_ply
 
 PARTS = ("cameras", "images", "points3D")
 FORMATS = ("bin", "txt")
+POINTS_PLY = "points3D.ply"  # of MASt3R's and DUSt3R's exporters, and of 3DGS
 
 
 def _folders(path: Path) -> list[Path]:
@@ -43,29 +44,34 @@ def has_model(path: Path) -> bool:
     return any((folder / f"{part}.{end}").is_file() for folder in _folders(path) for part in PARTS for end in FORMATS)
 
 
-def find_model(path: Path) -> tuple[Path, str]:
-    """Return the folder of a scene's COLMAP model and its format, "bin" (preferred) or "txt".
+def find_model(path: Path, need_points: bool = True) -> tuple[Path, str, Path | None]:
+    """Return the folder of a scene's COLMAP model, its format, "bin" (preferred) or "txt", and the file of its points.
 
-    Of several models it is the one with the most registered photos, else the first of sparse/0, sparse/1 and so on,
-    sparse and `path` itself.
+    Points lie in points3D.bin or .txt, as the model, else in points3D.ply; None without any. Of several models it is
+    the one with the most registered photos, else the first of sparse/0, sparse/1 and so on, sparse and `path` itself.
 
     Raises:
-        FileNotFoundError: there is no complete model; the message names the missing files of a partial one.
+        FileNotFoundError: there is no complete model; the message names the missing files of a partial one. Points are
+            a part of it if `need_points`.
     """
     partial = None
-    models = []
+    models: list[tuple[Path, str, Path | None]] = []
     for folder in _folders(path):
-        missing = {
-            end: [f"{part}.{end}" for part in PARTS if not (folder / f"{part}.{end}").is_file()] for end in FORMATS
-        }
-        complete = [end for end in FORMATS if not missing[end]]
-        if complete:
-            models.append((folder, complete[0]))
-        for names in missing.values():
-            if len(names) < len(PARTS) and partial is None:
-                partial = f"{path}: incomplete COLMAP model in {folder}: {' and '.join(names)} not found"
+        for end in FORMATS:
+            missing = [f"{part}.{end}" for part in ("cameras", "images") if not (folder / f"{part}.{end}").is_file()]
+            own = folder / f"points3D.{end}"
+            points = next((file for file in (own, folder / POINTS_PLY) if file.is_file()), None)
+            begun = len(missing) < 2 or own.is_file()
+            if points is None and (need_points or missing):
+                missing.append(own.name)
+            if not missing:
+                models.append((folder, end, points))
+                break
+            if begun and partial is None:
+                partial = f"{path}: incomplete COLMAP model in {folder}: {' and '.join(missing)} not found"
+                partial += "; --points FILE.ply stands in for it" if missing == [own.name] else ""
     if models:
-        return models[0] if len(models) == 1 else max(models, key=lambda model: count_images(*model))
+        return models[0] if len(models) == 1 else max(models, key=lambda model: count_images(*model[:2]))
     raise FileNotFoundError(
         partial
         or f"{path}: no COLMAP model found, expected cameras, images and points3D (.bin or .txt) "
@@ -73,37 +79,45 @@ def find_model(path: Path) -> tuple[Path, str]:
     )
 
 
-def read_model(path: Path, images: Path, follow_links: bool = False) -> Capture:
+def read_model(path: Path, images: Path, follow_links: bool = False, need_points: bool = True) -> Capture:
     """Read the COLMAP model of a scene.
 
     Args:
         path: folder of the scene.
         images: folder of its photos.
         follow_links: see `load_scene`.
+        need_points: refuse a model without a file of points; one of no points is accepted.
 
     Raises:
         FileNotFoundError: there is no model.
         ValueError: the model is damaged, has no registered image, an invalid camera or pose, an image name that leaves
             the images folder or occurs twice, or points that are not finite.
     """
-    folder, suffix = find_model(path)
-    return capture_of((read_binary if suffix == "bin" else read_text)(folder), folder, images, follow_links)
+    folder, suffix, points = find_model(path, need_points)
+    in_ply = points is not None and points.name == POINTS_PLY
+    records = read_records(folder, suffix, points is not None and not in_ply)
+    cloud = read_ply(inside_folder(f"{folder}:", points, path, follow_links)) if points is not None and in_ply else None
+    return capture_of(records, folder, images, follow_links, cloud)
 
 
-def capture_of(records: Records, folder: Path, images: Path, follow_links: bool) -> Capture:
-    """Convert the records of a model; `folder` names it in messages. Arguments and errors are those of `read_model`."""
+def capture_of(records: Records, folder: Path, images: Path, follow_links: bool, cloud: Cloud | None = None) -> Capture:
+    """Convert the records of a model; `cloud` has the points of records without any.
+
+    `folder` names the model in messages. Other arguments and errors are those of `read_model`.
+    """
     if not records.images:
         raise ValueError(f"{folder}: the COLMAP model has no registered images")
     lenses: dict[int, Lens] = {}
     each = (_photo(image, records.cameras, lenses, folder, images, follow_links) for image in records.images.values())
     photos = distinct_photos(folder, each)
-    if not len(records.points.ids):
-        return Capture.of(folder, photos, None)
-    records = dataclasses.replace(records, points=_without_strays(records, folder))
-    capture = Capture.of(folder, photos, _cloud(records.points, folder))
+    points = records.points
+    if points is None or not len(points.ids):
+        return Capture.of(folder, photos, cloud)
+    points = _without_strays(points, records.images, folder)
+    capture = Capture.of(folder, photos, _cloud(points, folder))
     assert capture.cloud is not None
-    seen = _seen(records, capture.cloud.positions.astype(np.float32))
-    points_of = {photo.name: points for photo, points in zip(photos, seen, strict=True)}
+    seen = _seen(points, records.images, capture.cloud.positions.astype(np.float32))
+    points_of = {photo.name: positions for photo, positions in zip(photos, seen, strict=True)}
     photos = [dataclasses.replace(photo, points=points_of[photo.name]) for photo in capture.photos]
     return dataclasses.replace(capture, photos=photos)
 
@@ -126,7 +140,7 @@ def _photo(
             lenses[image.camera] = Lens(*cameras[image.camera])
         except ValueError as error:
             raise ValueError(f"{where}: the COLMAP camera of this image is not usable: {error}") from error
-    return Photo(name, file, _viewmat(where, image.pose), lenses[image.camera], points=np.zeros((0, 3), np.float32))
+    return Photo(name, file, _viewmat(where, image.pose), lenses[image.camera])
 
 
 def _viewmat(where: str, pose: tuple[float, ...]) -> np.ndarray:
@@ -146,10 +160,9 @@ def _viewmat(where: str, pose: tuple[float, ...]) -> np.ndarray:
     return viewmat
 
 
-def _without_strays(records: Records, folder: Path) -> PointRecords:
+def _without_strays(points: PointRecords, images: dict[int, ImageRecord], folder: Path) -> PointRecords:
     """Leave out, with a warning, observations of images that the model does not have."""
-    points = records.points
-    known = np.isin(points.seen_by, np.array(list(records.images), np.uint32))
+    known = np.isin(points.seen_by, np.array(list(images), np.uint32))
     if known.all():
         return points
     strays = np.unique(points.seen_by[~known])
@@ -163,10 +176,9 @@ def _without_strays(records: Records, folder: Path) -> PointRecords:
     return dataclasses.replace(points, seen_by=points.seen_by[known], points=kept, lengths=lengths)
 
 
-def _seen(records: Records, positions: np.ndarray) -> list[np.ndarray]:
+def _seen(points: PointRecords, images: dict[int, ImageRecord], positions: np.ndarray) -> list[np.ndarray]:
     """For each image, those (M, 3) of the positions (P, 3) that were triangulated from it, by ascending id."""
-    points = records.points
-    identities = np.array(list(records.images), np.int64)
+    identities = np.array(list(images), np.int64)
     ascending = np.argsort(identities)
     # Observations are the largest arrays of a model, so they are processed in place.
     pairs = np.searchsorted(identities[ascending].astype(np.uint32), points.seen_by)

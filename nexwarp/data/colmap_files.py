@@ -80,34 +80,34 @@ class PointRecords:
 
 @dataclass(frozen=True)
 class Records:
-    """The records of a model: cameras and images by id, and points."""
+    """The records of a model: cameras and images by id, and points, or None."""
 
     cameras: dict[int, CameraRecord]
     images: dict[int, ImageRecord]
-    points: PointRecords
+    points: PointRecords | None
 
 
-def read_binary(folder: Path) -> Records:
-    """Read cameras.bin, images.bin and points3D.bin.
+def read_records(folder: Path, suffix: str, points: bool = True) -> Records:
+    """Read the cameras and images of a model, "bin" or "txt", and its points, unless it has none of this kind.
 
     Raises:
-        ValueError: a file is truncated or damaged, or exceeds the limits above; the message names it.
+        ValueError: a file is truncated or damaged, or exceeds the limits above; the message names it, and the line.
     """
-    with _opened(folder / "cameras.bin") as file:
-        cameras = _unique(file.path, (_binary_camera(file) for _ in range(file.count(MAX_CAMERAS))))
-    with _opened(folder / "images.bin") as file:
-        images = _unique(file.path, (_binary_image(file) for _ in range(file.count(MAX_IMAGES))))
-    with _opened(folder / "points3D.bin") as file:
-        points = _binary_points(file)
-    return Records(cameras, images, points)
-
-
-def read_text(folder: Path) -> Records:
-    """Read cameras.txt, images.txt and points3D.txt; errors are those of `read_binary`, with the line number."""
-    lines = _lines(folder / "cameras.txt")
-    cameras = _unique(folder / "cameras.txt", (_text_camera(where, line) for where, line in lines), MAX_CAMERAS)
-    images = _unique(folder / "images.txt", _text_images(folder / "images.txt"), MAX_IMAGES)
-    return Records(cameras, images, _text_points(folder / "points3D.txt"))
+    if suffix == "bin":
+        with _opened(folder / "cameras.bin") as file:
+            cameras = _unique(file.path, (_binary_camera(file) for _ in range(file.count(MAX_CAMERAS))))
+        with _opened(folder / "images.bin") as file:
+            images = _unique(file.path, (_binary_image(file) for _ in range(file.count(MAX_IMAGES))))
+        if points:
+            with _opened(folder / "points3D.bin") as file:
+                return Records(cameras, images, _binary_points(file))
+    else:
+        lines = _lines(folder / "cameras.txt")
+        cameras = _unique(folder / "cameras.txt", (_text_camera(where, line) for where, line in lines), MAX_CAMERAS)
+        images = _unique(folder / "images.txt", _text_images(folder / "images.txt"), MAX_IMAGES)
+        if points:
+            return Records(cameras, images, _text_points(folder / "points3D.txt"))
+    return Records(cameras, images, None)
 
 
 def count_images(folder: Path, suffix: str) -> int:

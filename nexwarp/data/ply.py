@@ -1,5 +1,6 @@
 """Points in PLY files: positions, and optionally colours."""
 
+import codecs
 import io
 import itertools
 from pathlib import Path
@@ -24,6 +25,7 @@ COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_bl
 HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")  # coefficients of the harmonic Y_0 of Gaussian splats
 BAND_0 = 0.28209479177387814
 GREY = 128
+OVERSHOOT = 2.0  # largest value of floating colours in [0, 1]; those with larger ones are in [0, 255]
 
 # Name, count, and properties as (name, numpy type); None for an element with lists.
 Element: TypeAlias = tuple[str, int, list[tuple[str, str]] | None]
@@ -34,15 +36,15 @@ def read_ply(path: Path) -> Cloud:
 
     Args:
         path: the file. Its vertices have x, y and z, and optionally colours: red, green, blue (or diffuse_red, ..., or
-            r, g, b) as integers of full range or floats in [0, 1], or f_dc_0, ... of Gaussian splats. Other properties
-            and elements are ignored.
+            r, g, b) as integers of 8 bits or of the type's full range, floats in [0, 1] or up to 255, or f_dc_0, ... of
+            Gaussian splats. Other properties and elements are ignored.
 
     Returns:
-        The points in the file's frame; grey if the file has no colours.
+        The points in the file's frame, perhaps none; grey if the file has no colours.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: the file is not PLY, is damaged or truncated, has no vertices, or positions that are not finite.
+        ValueError: the file is not PLY, is damaged or truncated, or has positions that are not finite.
     """
     vertices = read_vertices(path)
     lacking = [axis for axis in "xyz" if axis not in (vertices.dtype.names or ())]
@@ -65,7 +67,7 @@ def read_vertices(path: Path) -> np.ndarray:
 
 def _header(path: Path, file: io.BufferedReader) -> tuple[str, list[Element]]:
     """Read the format and the elements."""
-    if file.readline(16).strip() != b"ply":
+    if file.readline(16).removeprefix(codecs.BOM_UTF8).strip() != b"ply":
         raise ValueError(f"{path}: expected a PLY file, but it does not begin with 'ply'")
     form = None
     elements: list[Element] = []
@@ -122,8 +124,6 @@ def _vertices(path: Path, file: io.BufferedReader, form: str, elements: list[Ele
                 f"{path}: truncated, expected {count:,} of element {one_line(name, 60)}, got {left:,} bytes for them"
             )
         if name == "vertex":
-            if not count or not fields:
-                raise ValueError(f"{path}: expected at least one vertex, got none")
             return _ascii(path, file, dtype, count) if form == "ascii" else np.fromfile(file, dtype, count)
         if form == "ascii":
             for _ in range(count):
@@ -135,6 +135,8 @@ def _vertices(path: Path, file: io.BufferedReader, form: str, elements: list[Ele
 
 def _ascii(path: Path, file: io.BufferedReader, dtype: "np.dtype[np.void]", count: int) -> np.ndarray:
     names = dtype.names or ()
+    if not count or not names:
+        return np.empty(count, dtype)
     lines = itertools.islice((line for line in file if line.strip()), count)
     try:
         values = np.loadtxt(lines, np.float64, comments=None, max_rows=count, ndmin=2, encoding="ascii")
@@ -151,6 +153,14 @@ def _ascii(path: Path, file: io.BufferedReader, dtype: "np.dtype[np.void]", coun
     return vertices
 
 
+def _white(largest: float, dtype: np.dtype) -> float:
+    """Return the value of white for colours of a type: the narrowest range that holds the largest of them."""
+    if dtype.kind == "f":
+        return 1.0 if largest <= OVERSHOOT else 255.0
+    ranges = [255.0, 65535.0] if dtype.itemsize > 2 else [255.0]
+    return next((white for white in ranges if largest <= white and dtype.itemsize > 1), float(np.iinfo(dtype).max))
+
+
 def _colors(vertices: np.ndarray) -> np.ndarray:
     """(P, 3) uint8 colours; grey without any."""
     names = set(vertices.dtype.names or ())
@@ -158,8 +168,9 @@ def _colors(vertices: np.ndarray) -> np.ndarray:
     triple = next((triple for triple in COLORS if set(triple) <= names), None)
     if triple is not None:
         channels = [vertices[name] for name in triple]
-        scales = [255.0 / np.iinfo(c.dtype).max if c.dtype.kind in "iu" else 255.0 for c in channels]
-        values = np.stack([c * scale for c, scale in zip(channels, scales, strict=True)], axis=1)
+        values = np.stack(channels, axis=1).astype(np.float64)
+        largest = values.max(initial=0.0, where=np.isfinite(values))
+        values *= 255.0 / _white(largest, channels[0].dtype)
     elif set(HARMONICS) <= names:
         values = np.stack([255.0 * (0.5 + BAND_0 * vertices[name]) for name in HARMONICS], axis=1)
     return np.floor(np.nan_to_num(values, nan=float(GREY)).clip(0, 255) + 0.5).astype(np.uint8)

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -33,6 +34,7 @@ NEAR_FRACTION = 0.01  # near plane, in units of the scene scale
 SCALE_MARGIN = 1.1
 MAX_POINTS = 4_000_000  # to start from: more than any budget of surfels
 READERS = {"colmap": "a COLMAP model", "nerfstudio": NERFSTUDIO_FILE, "blender": BLENDER_FILES["train"]}
+JUDGED_PHOTOS, JUDGED_POINTS = 50, 5000  # of which some photo has to show some point
 MASKS, ALPHA, NONE = "masks", "alpha", "none"
 RANDOM = "random"
 # Host memory that reading takes while it goes on, in bytes a pixel of the photo as it lies in its file.
@@ -271,7 +273,7 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | No
             raise ValueError(f"{capture.source}: expected at least 2 registered images (1 to train, 1 to test), got 1")
         cloud = capture.cloud
         if source.points is not None:
-            cloud = read_ply(Path(source.points)).moved(capture.origin)
+            cloud = _given_points(Path(source.points), capture)
         tests = [
             index % TEST_EVERY == 0 if capture.test is None else photo.name in capture.test
             for index, photo in enumerate(capture.photos)
@@ -361,9 +363,26 @@ def _make_scene(
     )
 
 
+def _given_points(file: Path, capture: Capture) -> Cloud:
+    """Read the points of --points, in the capture's frame; warn if no photo shows any of them."""
+    cloud = read_ply(file).moved(capture.origin)
+    if not len(cloud.positions):
+        raise ValueError(f"{file}: expected at least one vertex, got none")
+    sample = cloud.positions[:: -(-len(cloud.positions) // JUDGED_POINTS)]
+
+    def shows(photo: Photo) -> bool:
+        pixels = photo.lens.project(sample @ photo.viewmat[:3, :3].T + photo.viewmat[:3, 3])
+        with np.errstate(invalid="ignore"):
+            return bool(((pixels >= 0) & (pixels < [photo.lens.width, photo.lens.height])).all(axis=1).any())
+
+    if not any(shows(photo) for photo in capture.photos[:: -(-len(capture.photos) // JUDGED_PHOTOS)]):
+        warnings.warn(f"{file}: no photo shows any of its points; are they in the scene's world frame?", stacklevel=2)
+    return cloud
+
+
 def _read_capture(source: SceneSource, path: Path, kind: str) -> Capture:
     if kind == "colmap":
-        capture = read_model(path, path / source.images, source.follow_links)
+        capture = read_model(path, path / source.images, source.follow_links, source.points is None)
         _check_folder("images", path, source.images)
         photos = [photo for photo in capture.photos if photo.file.is_file()]
         missing = [photo.name for photo in capture.photos if not photo.file.is_file()]

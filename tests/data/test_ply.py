@@ -103,7 +103,6 @@ BAD = {
     "endless header": (b"ply\nformat ascii 1.0\n" + b"comment x\n" * 10_000, "a PLY header of at most 65,536 bytes"),
     "endless line": (b"ply\nformat ascii 1.0\ncomment " + b"x" * 200_000, "a PLY header of at most 65,536 bytes"),
     "no vertices": (ply("element point 1\nproperty float x\n", b"1234"), "an element vertex, found none"),
-    "zero vertices": (ply(vertex(0, *XYZ), b""), "at least one vertex, got none"),
     "no z": (ply(vertex(1, *XYZ[:2]), ONE), "expected vertices with x, y and z, found no z"),
     "x twice": (ply(vertex(1, "float x", *XYZ), ONE + ONE), "properties of different names"),
     "truncated": (ply(vertex(2, *XYZ), ONE + ONE[:-1]), "truncated, expected 2 of element vertex, got 23 bytes"),
