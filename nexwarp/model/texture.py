@@ -56,6 +56,7 @@ class Texture(nn.Module):
 
     Attributes:
         residual: add the colours to the surfels' plain colours instead of replacing them.
+        sh_degree: of its colours, up to which a training raises the degree of pictures step by step.
         rates: first and last learning rate of all its parameters, which are the parameter group "texture" of a
             training; in between, rates fall log-linearly.
         per_surfel: names of parameters and buffers with a row for each surfel. Density control moves their rows;
@@ -64,6 +65,7 @@ class Texture(nn.Module):
     """
 
     residual: bool = False
+    sh_degree: int = 0
     rates: tuple[float, float] = (5e-3, 5e-4)
     per_surfel: tuple[str, ...] = ()
     config: Mapping[str, object]
@@ -71,6 +73,13 @@ class Texture(nn.Module):
     def colors(self, hits: Hits, camera: Camera | RayCamera) -> torch.Tensor:
         """Return the colours (H, W, K, 3) of hits; those in empty slots do not count, as long as they are finite."""
         raise NotImplementedError(f"{type(self).__name__}.colors: expected a method that returns colours of hits")
+
+    def half_copy_key(self) -> Hashable | None:
+        """Return what changes when a copy that evaluations read is made anew; None without a copy."""
+        return None
+
+    def drop_half_copy(self) -> None:
+        """Give up that copy."""
 
     def regulariser(self) -> torch.Tensor | None:
         """Return a scalar that a training adds to its loss as it is; None adds nothing."""

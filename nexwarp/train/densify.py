@@ -58,6 +58,15 @@ class DensityControl:
         full = len(self.surfels) >= FULL * self.max_surfels
         return c.relocate > 0 and rare and iteration < RELOCATE_UNTIL * c.stop and full
 
+    def unneeded(
+        self,
+        model: Model,
+        cameras: Sequence[Camera],
+        largest: Callable[[torch.Tensor], torch.Tensor] = lambda values: values,
+    ) -> torch.Tensor:
+        """Return the surfels (N,) bool of a model to remove in such a round; see `least_contributing`."""
+        return least_contributing(model, cameras, self.config.relocate, largest)
+
     def accumulate(self, errors: torch.Tensor) -> None:
         """Add the blended errors (N,) >= 0 of one view, such as `Rendering.splat_error` returns them."""
         check_tensors({"errors": (errors, tuple(self.errors.shape))}, device=self.errors.device)

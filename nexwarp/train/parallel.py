@@ -21,7 +21,6 @@ from nexwarp.model.graphs import Gradients, GraphKey, StepResult, UpdateError, c
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture, Texture
 from nexwarp.train.checkpoint import Snapshot
-from nexwarp.train.densify import least_contributing
 from nexwarp.train.ranks.ranks import GradientReducer, Ranks
 from nexwarp.train.recipe import Config
 from nexwarp.train.target import Target
@@ -75,10 +74,8 @@ class ParallelTrainer(Trainer):
         ranks.share_tensors(x for _, x in self._named_parameters())
         if self.poses is not None:
             ranks.share_tensors(self.poses.buffers())
-        grid = None
-        if isinstance(self.texture, NeuralTexture):
-            self.texture.drop_half_copy()
-            grid = self.texture.grid if config.max_hits else None
+        self.texture.drop_half_copy()
+        grid = self.texture.grid if isinstance(self.texture, NeuralTexture) and config.max_hits else None
         if beside is None:
             beside = sums_beside(ranks.backend, self.surfels, self.texture, config)
         self.beside = self.graphs is not None and beside
@@ -141,7 +138,7 @@ class ParallelTrainer(Trainer):
 
     def _unneeded(self) -> torch.Tensor:
         cameras = self.views.refined_cameras(self.poses)[self.ranks.rank :: self.ranks.size]
-        return least_contributing(self.model(), cameras, self.config.densify.relocate, self.ranks.largest)
+        return self.densifier.unneeded(self.model(), cameras, self.ranks.largest)
 
     def _trained(self) -> list[nn.Parameter]:
         return [x for group in self.optimizer.param_groups for x in group["params"]]

@@ -17,6 +17,8 @@ from nexwarp.errors import CheckpointError, check_finite
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import Json
 from nexwarp.model.bounds import check_bounds
+from nexwarp.model.model import Model
+from nexwarp.model.options import RenderOptions
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture, Texture
 from nexwarp.train.adam import FusedAdam
@@ -24,7 +26,7 @@ from nexwarp.train.checkpoint import Snapshot
 from nexwarp.train.densify import DensityControl
 from nexwarp.train.initial import Start, cells_unit, given_surfels, initial_poses, initial_surfels, initial_texture
 from nexwarp.train.recipe import Config
-from nexwarp.train.schedules import OptimizerMaker, make_optimizer
+from nexwarp.train.schedules import OptimizerMaker, make_optimizer, options_at
 from nexwarp.train.settings import config_from_dict, refuse_removed
 
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
@@ -37,6 +39,7 @@ class TrainingState:
     """What a training changes; `snapshot` is its value at one moment.
 
     Attributes:
+        background: colour behind everything, three numbers; known with the photos.
         poses: corrections of the training poses; None where they stay as given.
         generator: random numbers on the CPU.
         noise: random numbers on the device.
@@ -45,6 +48,8 @@ class TrainingState:
         seconds: that the steps took, in all sessions of the run.
         rate_factor: multiplies all learning rates; less than 1 after the run has gone back.
     """
+
+    background: tuple[float, float, float]
 
     def __init__(
         self,
@@ -118,6 +123,14 @@ class TrainingState:
         if self.scene.origin.any():
             facts["origin"] = self.scene.origin.tolist()
         return facts | {"iteration": self.iteration}
+
+    def model(self) -> Model:
+        """Return the model as it is now: the surfels and texture in training, at the photos' mean exposure."""
+        return Model(self.surfels, self.texture, options=self.render_options(), meta=self.facts())
+
+    def render_options(self) -> RenderOptions:
+        """Return how the scene is rendered at this point of the run."""
+        return options_at(self.config, self.iteration, self.background, self.texture.sh_degree)
 
     def save_cameras(self, folder: str | os.PathLike[str]) -> None:
         """Write the scene's cameras into a folder, so that a model there can be rendered from them."""

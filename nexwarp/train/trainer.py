@@ -14,18 +14,15 @@ from nexwarp.errors import DivergedError, OutOfMemoryError, SceneError
 from nexwarp.machine import deterministic, needed_memory, seed_everything, torch_threads
 from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, can_capture, graph_key, updating
 from nexwarp.model.model import Model
-from nexwarp.model.options import RenderOptions
 from nexwarp.model.render import draw
-from nexwarp.model.texture import NeuralTexture
 from nexwarp.train.checkpoint import Snapshot, load_checkpoint, save_checkpoint
-from nexwarp.train.densify import least_contributing
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.finish.finish import FinishObserver, finish_model
 from nexwarp.train.health import Health, oom_message, watched_tensors
 from nexwarp.train.initial import Start, check_start
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
-from nexwarp.train.schedules import OptimizerMaker, options_at, set_rates
+from nexwarp.train.schedules import OptimizerMaker, set_rates
 from nexwarp.train.state import TrainingState, check_origin, check_snapshot, checkpoint_errors, scene_digest
 from nexwarp.train.step_losses import OwnLoss, as_taken, check_own_losses, step_losses
 from nexwarp.train.target import Target, refined
@@ -42,7 +39,6 @@ class Trainer(TrainingState):
     Attributes, beside those of `TrainingState`:
         targets: what steps compare their renderings with.
         exposures: of the training photos; None where they have one exposure.
-        background: colour behind everything, three numbers.
         graphs: CUDA graphs of steps; None where steps are launched kernel by kernel.
         views_a_step: number of views of the last step: 1, or that of the ranks.
     """
@@ -219,30 +215,18 @@ class Trainer(TrainingState):
         self.densifier.step(self.optimizer, self.generator, unneeded, along)
 
     def _unneeded(self) -> torch.Tensor:
-        cameras = self.views.refined_cameras(self.poses)
-        return least_contributing(self.model(), cameras, self.config.densify.relocate)
+        return self.densifier.unneeded(self.model(), self.views.refined_cameras(self.poses))
 
     def _graph_key(self) -> GraphKey:
         tensors = [self.densifier.errors, *(parameter for _, parameter in self._named_parameters())]
         key = graph_key(self.render_options(), self.optimizer, tensors, densify=self.densifier.active(self.iteration))
-        copy = self.texture.half_copy_key() if isinstance(self.texture, NeuralTexture) else None
-        return key._replace(kernels=(key.kernels, copy))
-
-    def model(self) -> Model:
-        """Return the model as it is now: the trainer's own surfels and texture, at the photos' mean exposure."""
-        return Model(self.surfels, self.texture, options=self.render_options(), meta=self.facts())
-
-    def render_options(self) -> RenderOptions:
-        """Return how the scene is rendered at this point of the run."""
-        degree = self.texture.sh_degree if isinstance(self.texture, NeuralTexture) else 0
-        return options_at(self.config, self.iteration, self.background, degree)
+        return key._replace(kernels=(key.kernels, self.texture.half_copy_key()))
 
     def finish(self, observe: FinishObserver = lambda *_: None) -> Model:
         """Return a finished model of new surfels and the trainer's texture: smooth SH, detail limits, exposures."""
         if self.graphs is not None:
             self.graphs.clear()  # frees their memory; later steps are captured anew
-        if isinstance(self.texture, NeuralTexture):
-            self.texture.drop_half_copy()
+        self.texture.drop_half_copy()
         with torch.autocast(self.device.type, enabled=False):
             cameras = self.views.refined_cameras(self.poses)
             return finish_model(self.model(), self.scene.train, cameras, self.exposures, self.config, observe)

@@ -10,7 +10,6 @@ from nexwarp.cameras.camera import Camera, reduced
 from nexwarp.data import Scene
 from nexwarp.model.render import render
 from nexwarp.train import densify
-from nexwarp.train import trainer as trainers
 from nexwarp.train.densify import DensityControl, least_contributing
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import Config, DensifyConfig
@@ -89,11 +88,11 @@ def test_rounds_at_the_budget_relocate_in_the_first_part_of_density_control() ->
 def test_others_take_their_place(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     removed = []
 
-    def first(model, cameras, share):
+    def first(model, cameras, share, _):
         removed.append((trainer.iteration, len(model.surfels), len(cameras), share))
         return torch.arange(len(model.surfels)) < share * len(model.surfels)
 
-    monkeypatch.setattr(trainers, "least_contributing", first)
+    monkeypatch.setattr(densify, "least_contributing", first)
     config = small(iterations=120, densify=dataclasses.replace(OFTEN, relocate=0.2, prune_opacity=0.0, fraction=0.2))
     budget = 50
     trainer = Trainer(scene, dataclasses.replace(config, max_surfels=budget), "cpu")
