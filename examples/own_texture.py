@@ -10,7 +10,6 @@ import torch
 from torch import nn
 
 import nexwarp as nw
-from nexwarp.data import demo_folder
 
 
 @nw.register_texture  # so that model files can hold it
@@ -56,4 +55,4 @@ args, config = parser.parse_args(), nw.preset("default")
 rates = dataclasses.replace(config.rates, means=(5e-4, 5e-6), scales=0.025, opacities=0.05, sh0=0.0125)  # a short run
 config = dataclasses.replace(config, iterations=args.steps, max_surfels=3000, rates=rates)
 texture = Triplane if args.texture == "Triplane" else lambda scene, surfels: SurfelFeatures(len(surfels))
-print(nw.train(nw.load_scene(demo_folder()), config, texture=texture).save(args.out))
+print(nw.train(nw.load_scene("demo"), config, texture=texture).save(args.out))

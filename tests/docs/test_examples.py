@@ -79,6 +79,13 @@ def test_examples_import_the_public_face_alone(path: Path) -> None:
     assert names <= {*nw.__all__, "tape"}
 
 
+def test_own_textures_are_trained_and_saved(tmp_path: Path) -> None:
+    out = run("own_texture", "SurfelFeatures", "--steps", 12, "--out", tmp_path)
+    assert out.strip() == str(tmp_path / "model.safetensors")
+    with pytest.raises(ValueError, match="expected 'SurfelFeatures' to be registered"):
+        nw.load(tmp_path)
+
+
 def test_training_from_tensors_raises_the_psnr(tmp_path: Path) -> None:
     out = run("train_from_tensors", "--steps", 60, "--downscale", 4, "--out", tmp_path)
     steps = numbers(r"step \d+: ([\d.]+) dB", out)
