@@ -10,6 +10,11 @@ from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops.adam import Moments, adam_step
 from nexwarp.train.recipe import LossWeights
 
+# Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
+# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" (or "texture", of a
+# texture of one's own) and, where they are learned, "poses"; `lr`, the learning rate of the first step.
+ParameterGroup = dict[str, Any]
+
 
 class FusedAdam(torch.optim.Adam):
     """Adam whose step is one kernel a parameter; state, groups and checkpoints are those of `torch.optim.Adam`.
@@ -20,7 +25,7 @@ class FusedAdam(torch.optim.Adam):
         grid_loss: the regulariser's value before the last step; None without one.
     """
 
-    def __init__(self, groups: list[dict[str, Any]], *, eps: float) -> None:
+    def __init__(self, groups: list[ParameterGroup], *, eps: float) -> None:
         """Make an optimizer of groups whose learning rates are numbers, or tensors on the parameters' device."""
         capturable = all(isinstance(group["lr"], torch.Tensor) and group["lr"].is_cuda for group in groups)
         super().__init__(groups, eps=eps, fused=True, capturable=capturable)
@@ -29,7 +34,7 @@ class FusedAdam(torch.optim.Adam):
         self._factors: torch.Tensor | None = None
 
     # Torch wraps these for its compiler, whose import takes 0.6 s; a step of ours is never compiled.
-    def add_param_group(self, param_group: dict[str, Any]) -> None:
+    def add_param_group(self, param_group: ParameterGroup) -> None:
         """Add a parameter group, as `torch.optim.Adam` does."""
         inspect.unwrap(torch.optim.Adam.add_param_group)(self, param_group)
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, cast
+from typing import cast
 
 import torch
 
@@ -11,13 +11,9 @@ from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture, Texture
 from nexwarp.ops.tiles import Order
-from nexwarp.train.adam import FusedAdam, grid_factors
+from nexwarp.train.adam import FusedAdam, ParameterGroup, grid_factors
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
 
-# Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
-# "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" (or "texture", of a
-# texture of one's own) and, where they are learned, "poses"; `lr`, the learning rate of the first step.
-ParameterGroup = dict[str, Any]
 EPSILON = 1e-15
 # First and last learning rates of pose corrections, radians and scene scales, in a run of 30,000 steps.
 POSE_RATES = (2e-4, 2e-6)

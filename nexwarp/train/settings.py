@@ -11,6 +11,7 @@ from nexwarp.io.json_files import Json
 from nexwarp.train.recipe import DEFAULT, PRESETS, Config, typed
 
 PARTS = [field.name for field in dataclasses.fields(Config) if dataclasses.is_dataclass(getattr(DEFAULT, field.name))]
+Stored = Mapping[str, Any]  # settings, as `Config.as_dict` of any version returns them
 # What runs did before a setting existed, where the default does something else.
 BEFORE: dict[str, object] = {"skybox": 0, "teachers": 0, "densify.relocate": 0.0}
 # Settings that no version has any more, and the value with which they did nothing.
@@ -70,7 +71,7 @@ def parse_settings(texts: Iterable[str]) -> dict[str, Json]:
     return settings
 
 
-def config_from_dict(data: Mapping[str, Any]) -> Config:
+def config_from_dict(data: Stored) -> Config:
     """Rebuild a config from `Config.as_dict`; ValueError names a value of another type or out of range.
 
     Settings that an older version did not write are those of the preset that the run started from, but for those of
@@ -86,7 +87,7 @@ def config_from_dict(data: Mapping[str, Any]) -> Config:
         raise ValueError(f"config: expected the settings of a nexwarp run ({error})") from None
 
 
-def refuse_removed(data: Mapping[str, Any]) -> None:
+def refuse_removed(data: Stored) -> None:
     """Raise ValueError where settings, as an older version wrote them, ask for something that was removed since."""
     stored = _flat(data)
     for name, neutral in REMOVED.items():
@@ -94,9 +95,9 @@ def refuse_removed(data: Mapping[str, Any]) -> None:
             raise ValueError(f"{name}: {stored[name]} was removed; versions up to 0.2 have it")
 
 
-def _flat(data: Mapping[str, Any]) -> dict[str, Any]:
+def _flat(data: Stored) -> dict[str, object]:
     """Return the settings of `Config.as_dict`, or of another version, by name."""
-    flat: dict[str, Any] = {}
+    flat: dict[str, object] = {}
     for name, value in data.items():
         if name in PARTS:
             flat |= {f"{name}.{key}": x for key, x in value.items()}

@@ -218,10 +218,3 @@ def stage_runner(
         return ParallelTrainer(scene, stage.config, device, ranks, **options)
 
     return StageRunner(divide(config, own), make, store, models)
-
-
-def student_trainer(scene: Scene, config: Config, device: torch.device | str, **options: Any) -> Trainer:
-    """Train the teachers of a run, and return the trainer of its student, before its first step."""
-    runner = stage_runner(scene, config, device, StageStore(), **options)
-    runner.train_teachers()
-    return runner.trainer

@@ -251,7 +251,7 @@ def checkpoint_errors(run: Path | str) -> Iterator[None]:
         raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
 
 
-def check_origin(origin: Mapping[str, Any], config: Config, state: Mapping[str, Any], *, extend: bool = False) -> None:
+def check_origin(origin: Mapping[str, str], config: Config, state: Mapping[str, Any], *, extend: bool = False) -> None:
     """Raise ValueError unless a snapshot's state comes from a run of this scene with these settings and teachers.
 
     With `extend`, the run may have had fewer iterations.
