@@ -3,6 +3,7 @@
 import argparse
 import asyncio
 import base64
+import hashlib
 import io
 import os
 import sys
@@ -21,6 +22,17 @@ NAMES = sorted(path.stem for path in FOLDER.glob("*.ipynb"))
 JPEG_QUALITY = 88
 MINUTES = 30  # for one cell, at most
 NO_DRIVER = "Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"  # written by Warp's C code, always
+
+
+def sources(notebook: nbformat.NotebookNode) -> str:
+    """Digest of the code that a notebook's outputs were made of: another one shows that they are stale."""
+    code = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
+    return hashlib.sha256("\0".join(code).encode()).hexdigest()
+
+
+def pictures(notebook: nbformat.NotebookNode) -> list[int]:
+    """How many pictures each cell of code gives."""
+    return [sum("data" in output for output in cell.outputs) for cell in notebook.cells if cell.cell_type == "code"]
 
 
 def execute(source: Path, target: Path) -> None:
@@ -51,6 +63,7 @@ def execute(source: Path, target: Path) -> None:
                     raise RuntimeError(f"{source.name}: expected nothing on stderr, got {output.text}")
     notebook.metadata = {key: notebook.metadata[key] for key in ("kernelspec", "language_info")}
     notebook.metadata["language_info"] = {"name": "python"}  # and no versions, which differ from machine to machine
+    notebook.metadata["sources"] = sources(notebook)
     with written_aside(target) as temporary:
         nbformat.write(notebook, temporary)
 
@@ -62,14 +75,14 @@ def _no_driver(output: nbformat.NotebookNode) -> bool:
 
 
 def _shrink(output: nbformat.NotebookNode) -> None:
-    """Make a PNG a JPEG where that takes less than half: photos, not plots."""
+    """Make a PNG a JPEG where that takes less than 0.6 of it: photos, not plots."""
     png = output.get("data", {}).get("image/png")
     if png is None:
         return
     jpeg = io.BytesIO()
     Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB").save(jpeg, "JPEG", quality=JPEG_QUALITY, subsampling=0)
     text = base64.b64encode(jpeg.getvalue()).decode()
-    if len(text) < len(png) / 2:
+    if len(text) < 0.6 * len(png):
         del output.data["image/png"]
         output.data["image/jpeg"] = text
 
@@ -92,10 +105,16 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ["NEXWARP_SHORT"] = "1"
     if sys.platform == "win32":
         asyncio.set_event_loop_policy(asyncio.WindowsSelectorEventLoopPolicy())
+    if given.out is not None:
+        given.out.mkdir(parents=True, exist_ok=True)
     for name in given.names or NAMES:
         start = time.perf_counter()
+        source, target = ((folder / f"{name}.ipynb") for folder in (FOLDER, given.out or FOLDER))
         try:
-            execute(FOLDER / f"{name}.ipynb", (given.out or FOLDER) / f"{name}.ipynb")
+            execute(source, target)
+            kept, made = (pictures(nbformat.read(path, as_version=4)) for path in (source, target))
+            if kept != made:
+                raise RuntimeError(f"{name}: expected as many pictures as the kept outputs have, {kept}, got {made}")
         except RuntimeError as error:
             print(f"{name}: FAILED\n{error}", file=sys.stderr)
             return 1

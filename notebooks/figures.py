@@ -1,5 +1,6 @@
-"""Figures of the notebooks: rows of pictures with titles and colour bars, and plots."""
+"""Figures of the notebooks: rows of pictures with titles and colour bars, and plots, each with its origin below it."""
 
+import datetime
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +10,9 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+
+from benchmarks.timing import device_name
 
 WIDTH = 9.6  # of a figure, inches
 
@@ -67,16 +71,30 @@ def surfel_colours(ids: torch.Tensor) -> torch.Tensor:
     return torch.where((ids >= 0)[..., None], palette[ids.clamp_min(0)], 1.0)
 
 
-def show(panels: Sequence[ImagePanel], columns: int | None = None, width: float = WIDTH) -> np.ndarray:
-    """Draw panels row by row and return their axes, an array of rows."""
+def made_here(near: float) -> str:
+    """Origin of a figure that is computed now: date, machine, near plane."""
+    device = device_name("cuda" if torch.cuda.is_available() else "cpu")
+    return f"{datetime.date.today()}, {device}, near plane {near:.3g}"
+
+
+def _sign(fig: Figure, origin: str) -> None:
+    fig.supxlabel(origin, x=0.995, ha="right", fontsize=6, color="0.4")
+
+
+def show(panels: Sequence[ImagePanel], origin: str, columns: int | None = None, width: float = WIDTH) -> np.ndarray:
+    """Draw panels row by row, `origin` below them, and return their axes, an array of rows."""
     columns = columns or len(panels)
     rows = -(-len(panels) // columns)
     bars = any(panel.cmap for panel in panels)
     height, across = panels[0].values.shape[:2]
     side = width / columns
     fig, axes = plt.subplots(
-        rows, columns, figsize=(width, rows * (side * height / across * (0.84 if bars else 1.0) + 0.3)), squeeze=False
+        rows,
+        columns,
+        figsize=(width, rows * (side * height / across * (0.84 if bars else 1.0) + 0.3) + 0.15),
+        squeeze=False,
     )
+    _sign(fig, origin)
     for axis in axes.flat:
         axis.set_axis_off()
     for axis, panel in zip(axes.flat, panels, strict=False):
@@ -87,9 +105,10 @@ def show(panels: Sequence[ImagePanel], columns: int | None = None, width: float 
     return axes
 
 
-def plots(count: int, height: float = 2.6, width: float = WIDTH) -> list[Axes]:
-    """Axes of `count` plots side by side, with a faint grid."""
-    _, axes = plt.subplots(1, count, figsize=(width, height), squeeze=False, layout="constrained")
+def plots(count: int, origin: str, height: float = 2.6, width: float = WIDTH) -> list[Axes]:
+    """Axes of `count` plots side by side, with a faint grid, and `origin` below them."""
+    fig, axes = plt.subplots(1, count, figsize=(width, height + 0.15), squeeze=False, layout="constrained")
+    _sign(fig, origin)
     for axis in axes.flat:
         axis.grid(alpha=0.25)
     return list(axes.flat)
