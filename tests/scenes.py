@@ -111,7 +111,7 @@ def layered_scene(
 
 
 def named_scene(name: str, dtype: torch.dtype, device: torch.device | str) -> Scene:
-    """Make one of the scenes on which renderings are compared: "random", "off_centre", "specks", "layered", "wide"."""
+    """Make one of the scenes on which renderings are compared: random, off_centre, specks, near, layered, wide."""
     if name == "layered":
         return layered_scene(dtype=dtype, device=device)
     if name == "wide":  # a view of 90 degrees, in whose corners z-depth and distance sort surfels differently
@@ -121,6 +121,8 @@ def named_scene(name: str, dtype: torch.dtype, device: torch.device | str) -> Sc
     scene = random_scene(seed=1, off_centre=name == "off_centre", dtype=dtype, device=device)
     if name == "specks":
         scene["scales"] *= 0.1
+    if name == "near":  # the plane lies amid the surfels
+        scene["near"] = 3.0
     return scene
 
 

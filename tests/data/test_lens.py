@@ -56,7 +56,13 @@ def fisheye(x, y, k1, k2, k3, k4):
     return x * bent / r, y * bent / r
 
 
-@pytest.mark.parametrize(("model", "closed"), [("OPENCV", opencv), ("OPENCV_FISHEYE", fisheye)])
+def brown(x, y, k1, k2, p1, p2, k3, k4):
+    r = x * x + y * y
+    bent_x, bent_y = opencv(x, y, k1, k2, p1, p2)
+    return bent_x + x * (k3 * r**3 + k4 * r**4), bent_y + y * (k3 * r**3 + k4 * r**4)
+
+
+@pytest.mark.parametrize(("model", "closed"), [("OPENCV", opencv), ("OPENCV_FISHEYE", fisheye), ("BROWN", brown)])
 def test_maps_are_opencvs_formulas(model, closed):
     target = lens(model).undistorted()
     x, y, _ = rays_of(target).T

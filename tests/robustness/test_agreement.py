@@ -24,6 +24,7 @@ CASES = [
     ("off_centre", True, 8, 2, False),
     ("off_centre", True, 2, 3, True),
     ("specks", True, 2, 3, False),
+    ("near", True, 2, 3, False),
     ("random", "residual", 2, 3, False),
     ("layered", "residual", 8, 1, False),
     ("off_centre", "residual", 1, 2, False),

@@ -4,8 +4,11 @@ import base64
 import json
 import re
 
+import pytest
+
 from nexwarp.export.web.export import INDEX, export_web, one_file, static_files
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
+from nexwarp.kernels import sh
 from tests.export.web.scene_reader import read_sections
 from tests.export.web.support import named_cameras, web_model
 
@@ -54,3 +57,12 @@ def test_titles_are_text(tmp_path, monkeypatch):
     index = (tmp_path / "page" / INDEX).read_text(encoding="utf-8")
     assert "&lt;b&gt;R&amp;D&lt;/b&gt;" in index and "<b>R&D" not in index and "__TITLE__" not in index
     assert read_sections((tmp_path / "page" / SCENE_FILE).read_bytes())[0]["surfels"] == 5
+
+
+@pytest.mark.parametrize("name", ["shaders/common.wgsl", "baked_shaders.js"])
+def test_spherical_harmonics_of_shaders_have_the_kernels_constants(name: str) -> None:
+    """All digits, and no other constants: pictures would not show half a percent of one."""
+    text = static_files()[name].decode()
+    basis = text[text.index("0.28209") : text.rindex("3.0 * ")]
+    constants = {float(number) for number in re.findall(r"(?<![\w.])\d+\.\d+", basis)} - {2.0, 3.0, 4.0, 0.0}
+    assert constants == {sh.BAND_0, sh.BAND_1, *sh.BAND_2, *sh.BAND_3}

@@ -17,6 +17,7 @@ from nexwarp.model.options import RenderOptions
 from nexwarp.viewer.modes import facing_normals, id_colours
 from tests.export.web.support import CHROMIUM, WEBGPU, Site, named_cameras, psnr, web_model
 from tests.export.web.test_scene_file import damaged
+from tests.scenes import make_camera, make_surfels, random_scene
 from tests.tolerances import FLIPS, WEB_PSNR, assert_close, assert_same_ids
 
 pytestmark = [
@@ -167,6 +168,40 @@ def test_all_buffers_are_those_of_the_model(tab, case):
     for name, buffer in buffers.items():
         # Drivers may compute exp2 and log2 with a few units in the last place; opacities near 1 amplify them.
         assert_close(buffer, getattr(expected, name), kind="value", name=name, allow_flips=FLIPS)
+
+
+@torch.no_grad()
+def test_hits_before_the_near_plane_do_not_count(tab, default):
+    """Surfels lie before the plane, behind it and across it."""
+    model, camera = default
+    depths = model.render(camera).depths[..., 0]
+    near = float(depths[depths > 0].median())
+    camera = nw.Camera(camera.viewmat, camera.K, camera.width, camera.height, near)
+    expected, everything = model.render(camera).image, tab.render(default[1])[1]["image"]
+    assert (everything - expected).abs().max() > 0.1
+    assert_close(tab.render(camera)[1]["image"], expected, kind="value", name="image", allow_flips=FLIPS)
+
+
+@torch.no_grad()
+def test_of_equal_weights_the_nearer_hit_comes_first(tab):
+    """Each pixel sees two surfels of its own, nearly of equal weights; some are equal to the bit."""
+    side = 24
+    near = torch.linspace(-1.2, -1.0, side**2)  # logits
+    far = (near.sigmoid() / (1 - near.sigmoid())).logit()
+    y, x = torch.meshgrid(*[(torch.arange(side) + 0.5) / side - 0.5] * 2, indexing="ij")
+    rays = torch.stack([x.flatten(), y.flatten(), torch.ones(side**2)], 1)
+    scene = random_scene(2 * side**2, width=side, height=side)
+    scene |= {"means": torch.cat([2 * rays, rays]), "quats": torch.eye(4)[:1].expand(2 * side**2, 4)}
+    scene |= {"scales": torch.full((2 * side**2, 2), 0.1 / side), "gammas": torch.ones(2 * side**2, 2)}
+    scene |= {"viewmat": torch.eye(4), "K": torch.tensor([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])}
+    surfels, camera = make_surfels(scene), make_camera(scene)
+    surfels.logit_opacities.copy_(torch.cat([far, near]))
+    model = nw.Model(surfels, None, options=RenderOptions(max_hits=2))
+    tab.load(encode_scene(model, named_cameras(camera), quality="full"))
+    _, out = tab.render(camera, "ids", "weights")
+    equal = out["weights"][..., 0] == out["weights"][..., 1]
+    assert equal.sum() > 10
+    assert (out["ids"][equal][:, 0] >= side**2).all()
 
 
 @torch.no_grad()
