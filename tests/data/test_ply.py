@@ -137,27 +137,3 @@ def test_bad_files_are_told_in_one_line(tmp_path, kind):
     with pytest.raises(ValueError, match=message) as caught:
         read_ply(tmp_path / "a.ply")
     assert "\n" not in str(caught.value) and str(tmp_path / "a.ply") in str(caught.value)
-
-
-def test_damaged_files_never_crash(tmp_path):
-    """Cut off or with bytes changed at 300 places: points come back, or one line."""
-    rows = "".join(f"{x:.3f} {y:.3f} {z:.3f}\n" for x, y, z in POINTS)
-    binary = ply(vertex(40, "double x", "double y", "double z"), POINTS.tobytes())
-    goods = [binary, ply(vertex(40, *XYZ), rows.encode(), "ascii")]
-    outcomes = {"read": 0, "refused": 0}
-    for trial in range(300):
-        data = bytearray(goods[trial % 2])
-        if trial % 3 == 0:
-            data = data[: RNG.integers(len(data))]
-        else:
-            for place in RNG.integers(0, len(data) if trial % 3 == 1 else 300, 3):
-                data[place] = RNG.integers(256)
-        (tmp_path / "a.ply").write_bytes(data)
-        try:
-            points, colors = positions_and_colors(tmp_path / "a.ply")
-            assert points.shape == colors.shape and np.isfinite(points).all()
-            outcomes["read"] += 1
-        except ValueError as error:
-            assert "\n" not in str(error)
-            outcomes["refused"] += 1
-    assert min(outcomes.values()) > 10

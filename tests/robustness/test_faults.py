@@ -4,19 +4,14 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import nexwarp as nw
-from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
-from nexwarp.errors import NexwarpError
 from nexwarp.io.pictures import load_exr
-from nexwarp.run.folder import read_metrics, read_run
-from nexwarp.train.checkpoint import _read_checkpoint, load_checkpoint
+from nexwarp.train.checkpoint import _read_checkpoint
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from tests.faults import Disk, failing
 from tests.scene_writers import write_demo
@@ -172,40 +167,3 @@ def test_other_commands_survive_every_fault(trained, tmp_path, capsys, arguments
         now = files(run)
         assert before.keys() <= now.keys() <= after.keys()
         assert all(now[name] in (before.get(name), after[name]) for name in now)
-
-
-# Files that are read back
-
-
-def lengths(content: bytes) -> list[int]:
-    """Of a truncated file: nothing, around the header and its length, halves, all but the end."""
-    size = len(content)
-    header = 8 + int.from_bytes(content[:8], "little") if size > 8 else 0
-    places = (0, 1, 7, 8, 9, 16, header - 1, header, header + 1, size // 4, size // 2, size - 8, size - 2, size - 1)
-    return sorted({length for length in places if 0 <= length < size})
-
-
-@pytest.mark.parametrize(
-    ("name", "read"),
-    [
-        ("model.safetensors", nw.load),
-        ("config.json", lambda file: read_run(file.parent)),
-        ("cameras.json", load_cameras),
-        ("metrics.json", lambda file: read_metrics(file.parent)),
-        ("checkpoint/state.json", lambda file: load_checkpoint(file.parents[1])),
-        ("checkpoint/tensors.safetensors", lambda file: load_checkpoint(file.parents[1])),
-    ],
-)
-def test_truncated_files_are_refused(trained, tmp_path, name, read: Callable[[Path], Any]):
-    run = Path(shutil.copytree(trained, tmp_path / "run"))
-    shutil.rmtree(run / "checkpoint.old")
-    file = run / name
-    content = file.read_bytes()
-    read(file)
-    whole = content.rstrip() if name.endswith(".json") else content  # the last line's end is not missed
-    for length in sorted({*lengths(whole), *range(0, len(whole), max(len(whole) // 100, 1))}):
-        file.write_bytes(content[:length])
-        with pytest.raises(NexwarpError) as caught:
-            read(file)
-        assert isinstance(caught.value, ValueError) and "\n" not in str(caught.value)
-        assert str(caught.value).startswith(str(run)), caught.value

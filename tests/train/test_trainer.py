@@ -130,6 +130,7 @@ def test_progress_tells_what_happened(scene):
 
 
 @pytest.mark.skipif(not FOX.is_dir(), reason=f"{FOX} is not there")
+@pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_it_learns_from_real_photos():
     """Fox at downscale 8: 5 dB more on views it has not seen than after the first iteration."""
