@@ -1,22 +1,36 @@
-"""The control panels: one for each client, whose values are clamped to their ranges, and one of a training for all."""
+"""The control panels: one for each client, whose values are clamped to their ranges, and one of a training for all.
 
+A panel has an editor of camera paths: views that a browser adds, to play and to keep for `nexwarp render --path`.
+Events that are coroutines run on viser's event loop, one after another. Functions would wait for a thread of its pool,
+in a queue without a limit.
+"""
+
+import asyncio
 import html
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+import math
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+import torch
 
+from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.paths import interpolate
 from nexwarp.io.pictures import viridis
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
-from nexwarp.viewer.camera_path import PathEditor
-from nexwarp.viewer.controls import T, on_change, on_click, set_changed, within
 from nexwarp.viewer.modes import BY_SLOT, MODES, Picture
+from nexwarp.viewer.world import Viewpoint, camera_to_world, vertical_fov
 
 if TYPE_CHECKING:
     import viser
 
     from nexwarp.viewer.session import Session
 
+T = TypeVar("T")
+FPS, PLAY_FPS = 30, 20  # of a camera path, as it is kept and played
+SECONDS = (0.1, 600.0)
+MOST_VIEWS = 200  # of a path
 FOV_DEGREES = (15.0, 110.0)
 SCREENSHOT_HEIGHTS = (64, 2160)
 TELL_SECONDS = 0.5  # between two updates of a training's status line
@@ -27,6 +41,94 @@ HELP = """\
 
 **Click a frustum** to go to the camera of its photo"""
 SMALL = "padding:0 0.8em 0.2em;font-size:0.85em;opacity:0.8"
+
+
+def on_change(control: "viser.GuiInputHandle[T]", act: Callable[[T], None]) -> None:
+    """Call `act` with each new value of a control."""
+
+    async def updated(event: "viser.GuiEvent[viser.GuiInputHandle[T]]") -> None:
+        act(event.target.value)
+
+    control.on_update(updated)
+
+
+def on_click(button: "viser.GuiButtonHandle", act: Callable[[], Awaitable[None] | None]) -> None:
+    """Call `act`, or await it, at each click."""
+
+    async def clicked(_: object) -> None:
+        done = act()
+        if done is not None:
+            await done
+
+    button.on_click(clicked)
+
+
+def set_changed(handle: object, name: str, value: object) -> None:
+    """Set a property of a control if that changes it."""
+    if getattr(handle, name) != value:
+        setattr(handle, name, value)
+
+
+def within(value: float, ends: tuple[float, float]) -> float:
+    """Clamp a number to a range; NaN and infinity become its lower end."""
+    return min(max(value, ends[0]), ends[1]) if math.isfinite(value) else ends[0]
+
+
+class PathEditor:
+    """A path through views of one client, and its controls."""
+
+    def __init__(self, session: "Session", save: Callable[[Sequence[Camera]], str]) -> None:
+        from viser import Icon
+
+        self.session, self.save = session, save
+        self.views: tuple[Camera, ...] = ()  # replaced, never changed: two threads read it
+        self.playing = False
+        gui = session.client.gui
+        self.note = gui.add_markdown("**Camera path** through views that you add, for `nexwarp render --path`")
+        on_click(gui.add_button("Add this view", icon=Icon.PLUS), self.add)
+        on_click(gui.add_button("Remove the last", icon=Icon.BACKSPACE, color="gray"), self.remove)
+        self.seconds = gui.add_number("Seconds", 6.0, min=SECONDS[0], max=SECONDS[1], step=0.1)
+        on_click(gui.add_button("Play, stop", icon=Icon.PLAYER_PLAY, color="gray"), self.play)
+        gui.add_button("Save path", icon=Icon.DEVICE_FLOPPY).on_click(lambda _: self.keep())  # on a thread: it writes
+
+    def add(self) -> None:
+        """Append the current view, with the size of the home view; video codecs need even sizes."""
+        here, home = self.session.viewpoint, self.session.home
+        if here is not None and len(self.views) < MOST_VIEWS:
+            size = (max(home.width // 2 * 2, 2), max(home.height // 2 * 2, 2))
+            (view,) = Viewpoint(here.pose, here.fov, *size).bands(1.0, 0.01, torch.zeros(0))
+            self.views = (*self.views, view)
+            self.note.content = f"{len(self.views)} of at most {MOST_VIEWS} views"
+
+    def remove(self) -> None:
+        """Remove the last view."""
+        self.views = self.views[:-1]
+        self.note.content = f"{len(self.views)} of at most {MOST_VIEWS} views"
+
+    def path(self, fps: int) -> list[Camera]:
+        """Return the path at some frames a second; ValueError without two different views."""
+        return interpolate(self.views, max(round(within(self.seconds.value, SECONDS) * fps), 2), len(self.views) or 2)
+
+    async def play(self) -> None:
+        """Move along the path once; stop if that is in progress."""
+        self.playing = not self.playing
+        start = time.perf_counter()
+        try:
+            for number, camera in enumerate(self.path(PLAY_FPS) if self.playing else (), 1):
+                self.session.go(camera_to_world(camera), vertical_fov(camera))
+                await asyncio.sleep(max(start + number / PLAY_FPS - time.perf_counter(), 0.0))
+                if self.session.closed.is_set() or not self.playing:
+                    break
+        except ValueError:
+            self.note.content = "Add at least two different views first"
+        self.playing = False
+
+    def keep(self) -> None:
+        """Write the path into the run, and show the command that renders it."""
+        try:
+            self.note.content = f"`{self.save(self.path(FPS))}`"
+        except (OSError, ValueError) as error:
+            self.note.content = f"The path was not saved: {error}"
 
 
 class Panel:

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from nexwarp.viewer.controls import set_changed
 from nexwarp.viewer.modes import Settings
-from nexwarp.viewer.panel import Panel
+from nexwarp.viewer.panel import Panel, set_changed
 from nexwarp.viewer.world import Viewpoint, camera_to_world, frustum_size, vertical_fov
 
 if TYPE_CHECKING:
