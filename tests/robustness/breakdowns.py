@@ -195,7 +195,7 @@ def faults(base: Base, words: list[str], normal: Measured, kind: str, share: flo
         child = started(base, words)
         if kind == "kill":
             time.sleep(share * normal.seconds)
-            os.killpg(child, signal.SIGKILL)
+            os.kill(child, signal.SIGKILL)
         code = ended(child)
         error = (base.folder / "err").read_text()
         if kind == "full" and not (code == 0 and not error):

@@ -36,15 +36,17 @@ def may_speak(error: BaseException | None) -> bool:
     """Wait for the rank that knows best why all end; whether it is for this one to say it, if it is still there.
 
     As soon as one rank has ended, the launcher ends the others. So rank 0 tells what all have met, then another what
-    it alone has met; and nobody needs to tell of a lost connection whose other end the launcher sees.
+    it alone has met; and nobody needs to tell of a lost connection whose other end `launch` sees.
     """
     if not is_rank():
         return True
     lost = isinstance(error, LostRankError)
+    if lost and STORE in os.environ:
+        return False
     first = os.environ["RANK"] == "0"
     with suppress(KeyboardInterrupt):
         time.sleep(LOST_SECONDS * lost + TURN_SECONDS * (not first))
-    return first if isinstance(error, KeyboardInterrupt) else not (lost and STORE in os.environ)
+    return first or not isinstance(error, KeyboardInterrupt)
 
 
 def end_process(code: int) -> int:

@@ -68,13 +68,12 @@ class Ranks:
         seconds = float(os.environ.get(WAIT_VARIABLE, JOIN_SECONDS))
         wait = timedelta(seconds=seconds)
         file = os.environ.get(STORE)
-        store: dist.Store
         try:
             if file is None:
                 store, rank, size = next(rendezvous("env://", timeout=wait))
             else:
                 rank, size = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
-                store = dist.FileStore(file, size)
+                store, _, _ = next(rendezvous(f"file://{file}", rank, size))
                 store.set(f"rank {rank}", "is here")
                 store.wait([f"rank {other}" for other in range(size)], wait)
             store = PrefixStore("nexwarp", store)
