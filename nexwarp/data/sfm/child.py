@@ -8,11 +8,10 @@ import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from nexwarp.data.sfm.frames import take_frames
 from nexwarp.data.sfm.options import SfmOptions
-from nexwarp.data.sfm.process import LOCK_FILE, REPORT_FILE, file_facts
+from nexwarp.data.sfm.process import LOCK_FILE, REPORT_FILE, Order, file_facts
 from nexwarp.data.sfm.stages import PYCOLMAP, Observer, Stages
 from nexwarp.errors import NexwarpError
 from nexwarp.io.files import one_line
@@ -24,10 +23,10 @@ def main() -> None:
     """Do what stdin orders, once."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what libraries print is no answer
-    order = json.loads(sys.stdin.readline())
-    threading.Thread(target=_end_with_parent, args=(Path(order["folder"]),), daemon=True).start()
+    order = Order(**json.loads(sys.stdin.readline()))
+    threading.Thread(target=_end_with_parent, args=(Path(order.folder),), daemon=True).start()
 
-    def answer(content: dict[str, Any]) -> None:
+    def answer(content: dict[str, object]) -> None:
         print(json.dumps(content), file=answers, flush=True)
 
     try:
@@ -37,7 +36,7 @@ def main() -> None:
         if needed_memory(error) is not None:
             kind = "OutOfMemoryError"
         elif isinstance(error, RuntimeError):  # pycolmap's
-            kind, text = "ValueError", f"{order['source']}: {PYCOLMAP}: {one_line(error)}"
+            kind, text = "ValueError", f"{order.source}: {PYCOLMAP}: {one_line(error)}"
         elif not isinstance(error, (ValueError, OSError)):
             text = f"{kind}: {text}"
         elif isinstance(error, ValueError) and not isinstance(error, NexwarpError):
@@ -58,14 +57,15 @@ def _end_with_parent(folder: Path) -> None:
     os._exit(1)
 
 
-def _make(order: dict[str, Any], observe: Observer) -> dict[str, Any]:
+def _make(order: Order, observe: Observer) -> dict[str, object]:
     """Make folder/scene of the photos, or of frames of the video, and return the report."""
-    source, folder, options = Path(order["source"]), Path(order["folder"]), SfmOptions(**order["options"])
-    names, choice = order["photos"], None
-    if order["video"]:
+    source, folder = Path(order.source), Path(order.folder)
+    options = SfmOptions(**order.options)  # type: ignore[arg-type]  # checked before
+    names, choice = order.photos, None
+    if order.video is not None:
         photos = folder / "frames"
         photos.mkdir()
-        choice = take_frames(source, order["frames"], photos, observe)
+        choice = take_frames(source, order.frames, photos, observe)
         source, names = photos, sorted(file.name for file in photos.iterdir())
         if options.matching == "auto":
             options = dataclasses.replace(options, matching="sequential")
@@ -75,6 +75,6 @@ def _make(order: dict[str, Any], observe: Observer) -> dict[str, Any]:
     scene = folder / "scene"
     content = dataclasses.asdict(report)
     files = {file.relative_to(scene).as_posix(): file_facts(file) for file in scene.rglob("*") if file.is_file()}
-    extra = {"options": dataclasses.asdict(options), "video": order["video"], "files": files}
+    extra = {"options": dataclasses.asdict(options), "video": order.video, "files": files}
     write_json(scene / REPORT_FILE, content | extra)
     return content

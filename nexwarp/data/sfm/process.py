@@ -16,9 +16,10 @@ import tempfile
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from signal import Signals
+from subprocess import PIPE
 from threading import Thread
 from typing import Any
 from zlib import crc32
@@ -26,14 +27,14 @@ from zlib import crc32
 from filelock import FileLock, Timeout
 
 from nexwarp import errors
-from nexwarp.data.sfm.frames import check_frames
+from nexwarp.data.sfm.frames import FrameChoice, check_frames
 from nexwarp.data.sfm.options import SfmOptions
 from nexwarp.data.sfm.photos import list_photos
-from nexwarp.data.sfm.report import SfmReport
+from nexwarp.data.sfm.report import EstimatedCamera, SfmReport
 from nexwarp.data.sfm.stages import PYCOLMAP, Observer
 from nexwarp.errors import SceneError, StorageError
 from nexwarp.io.files import make_folders, one_line, remove_empty
-from nexwarp.io.json_files import READ_ERRORS, Json, read_object
+from nexwarp.io.json_files import READ_ERRORS, Json, JsonObject, read_object
 
 REPORT_FILE = "sfm.json"
 PARTS = ("images", "sparse", REPORT_FILE)  # of a scene
@@ -50,6 +51,27 @@ WITHOUT_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP)  # of a file system
 KILLED = 9  # SIGKILL, also of the system when memory runs out
 PROBE = 2**20  # bytes that are written after a failure of pycolmap, to see whether the disk is full
 RAISED = ("SceneError", "FormatError", "SettingError", "OutOfMemoryError")
+
+
+@dataclass(frozen=True)
+class Order:
+    """What the other process is to do.
+
+    Attributes:
+        source: the video, or the folder of the photos.
+        photos: names of the photos; none for a video.
+        folder: folder to work in; the scene is made in its subfolder scene/.
+        frames: number of parts of a video.
+        options: those of `SfmOptions`.
+        video: the video's identity; None for photos.
+    """
+
+    source: str
+    photos: list[str]
+    folder: str
+    frames: int
+    options: JsonObject
+    video: JsonObject | None
 
 
 def process(
@@ -97,29 +119,23 @@ def process(
     scene = Path(scene).resolve() if Path(scene).is_symlink() else Path(scene)
     options.check()
     video = source.is_file()
-    names = [] if video else list_photos(source)
+    names: list[str] = [] if video else list_photos(source)
     if video:
         check_frames(source, frames)
     _check_target(source, scene, overwrite)
     inputs = [source / name for name in names] or [source]
     before = {file: _identity(file) for file in inputs}
     with _claimed(scene) as folder:
-        order: dict[str, Json] = {
-            "source": str(source.absolute()),
-            "photos": list(names),
-            "folder": str(folder),
-            "frames": frames,
-            "options": asdict(options),
-            "video": video_identity(source) if video else None,
-        }
+        identity = video_identity(source) if video else None
+        order = Order(str(source.absolute()), names, str(folder), frames, asdict(options), identity)
         try:
-            answer = _in_child(source, scene, order, observe)
+            report = _in_child(order, scene, observe)
         except Exception:
             _check_unchanged(before)
             raise
         _check_unchanged(before)
         _publish(folder / "scene", scene, folder / REPLACED if overwrite else None)
-    return SfmReport.of(answer)
+    return report
 
 
 def reconstruct(
@@ -167,20 +183,21 @@ def _check_unchanged(before: dict[Path, tuple[int, ...] | None]) -> None:
 # The process that works
 
 
-def _in_child(source: Path, scene: Path, order: dict[str, Json], observe: Observer) -> dict[str, Any]:
+def _in_child(order: Order, scene: Path, observe: Observer) -> SfmReport:
     """Let a process of its own do the work; return its report, or raise its error."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    pipes: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     # A session of its own: Ctrl-C in a terminal reaches this process alone, which then ends the other one.
-    with subprocess.Popen(CHILD, **pipes, env=environment, start_new_session=True) as child:
+    with subprocess.Popen(
+        CHILD, stdin=PIPE, stdout=PIPE, stderr=PIPE, env=environment, start_new_session=True
+    ) as child:
         assert child.stdin is not None and child.stdout is not None and child.stderr is not None
         last: deque[bytes] = deque(maxlen=LAST_LINES)
         listener = Thread(target=last.extend, args=(child.stderr,), daemon=True)
         listener.start()
-        answer: dict[str, Any] = {}
+        answer: Any = {}
         try:
             with suppress(BrokenPipeError):
-                child.stdin.write(json.dumps(order).encode() + b"\n")
+                child.stdin.write(json.dumps(asdict(order)).encode() + b"\n")
                 child.stdin.flush()
             for line in child.stdout:
                 answer = json.loads(line)
@@ -192,18 +209,23 @@ def _in_child(source: Path, scene: Path, order: dict[str, Json], observe: Observ
         child.wait()
         listener.join()
     if "report" in answer:
-        report: dict[str, Any] = answer["report"]
-        return report
+        report = answer["report"]
+        nested = {
+            "cameras": [EstimatedCamera(**camera) for camera in report["cameras"]],
+            "sizes": [tuple(size) for size in report["sizes"]],
+            "frames": report["frames"] and FrameChoice(**report["frames"]),
+        }
+        return SfmReport(**(report | nested))
     if "error" in answer:
         kind, text, number = answer["error"], answer["text"], answer["number"]
     else:
         kind, text, number = (
             "SceneError",
-            _end_of(source, child.returncode, b"".join(last).decode(errors="replace")),
+            _end_of(order.source, child.returncode, b"".join(last).decode(errors="replace")),
             None,
         )
     if PYCOLMAP in text:  # it seldom tells why
-        number = errno.ENOSPC if FULL.search(text) else _write_fault(Path(str(order["folder"])))
+        number = errno.ENOSPC if FULL.search(text) else _write_fault(Path(order.folder))
     if number in FULL_ERRORS:
         raise StorageError.at(scene, OSError(number, os.strerror(number)))
     if number is not None:
@@ -222,7 +244,7 @@ def _write_fault(folder: Path) -> int | None:
     return None
 
 
-def _end_of(source: Path, code: int, words: str) -> str:
+def _end_of(source: str, code: int, words: str) -> str:
     """Describe the end of a process that gave no answer, by its exit code and what it wrote to stderr."""
     lines = [line for line in words.splitlines() if line.strip()]
     reason = next((line for line in lines if REASON.search(line)), lines[-1] if lines else "no reason given")

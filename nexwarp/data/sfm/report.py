@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from nexwarp.data.sfm.frames import FrameChoice
 from nexwarp.data.sfm.pairs import components
@@ -91,16 +90,6 @@ class SfmReport:
     blurred: list[str]
     repeated: list[str]
     frames: FrameChoice | None = None
-
-    @classmethod
-    def of(cls, data: dict[str, Any]) -> "SfmReport":
-        """Return the report of what JSON holds of it."""
-        nested = {
-            "cameras": [EstimatedCamera(**camera) for camera in data["cameras"]],
-            "sizes": [tuple(size) for size in data["sizes"]],
-            "frames": data["frames"] and FrameChoice(**data["frames"]),
-        }
-        return cls(**(data | nested))
 
     def rows(self) -> dict[str, str]:
         """The figures as rows of a table: name -> text."""
