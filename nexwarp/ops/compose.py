@@ -1,7 +1,5 @@
 """Composition of the passes into one image."""
 
-import math
-
 import torch
 
 from nexwarp.kernels.compose import compose_kernels
@@ -35,30 +33,30 @@ def compose(
     return _Compose.apply(*(None if x is None else x.contiguous() for x in inputs))
 
 
-def _arrays(real: type, tensors: list[torch.Tensor | None]) -> list[Argument]:
+def _arrays(real: type, images: list[torch.Tensor | None]) -> list[Argument]:
+    """View images (H, W, ...) as the kernels do, one row a pixel; the background is an image of one."""
     vec3 = types(real).vec3
-    # The last dimensions of a pixel's values; the background is one row.
-    hits = next((x.shape[2] for x in (tensors[3], tensors[2]) if x is not None), 0)
-    shapes = ((3,), (3,), (hits, 3), (hits,), (), (3,))
     dtypes = (vec3, vec3, vec3, real, real, vec3)
-
-    def flat(x: torch.Tensor | None, shape: tuple[int, ...]) -> torch.Tensor | None:
-        return None if x is None else x.view(math.prod(x.shape[: x.dim() - len(shape)]), *shape)
-
-    return [array(flat(x, shape), dtype) for x, shape, dtype in zip(tensors, shapes, dtypes, strict=True)]
+    return [array(None if x is None else x.flatten(0, 1), dtype) for x, dtype in zip(images, dtypes, strict=True)]
 
 
 class _Compose(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Context, plain: torch.Tensor, *others: torch.Tensor | None) -> tuple[torch.Tensor, torch.Tensor]:
-        inputs = (plain, *others)
-        real = real_of(plain)
+    def forward(
+        ctx: Context,
+        plain: torch.Tensor,
+        base: torch.Tensor | None,
+        colors: torch.Tensor,
+        weights: torch.Tensor,
+        alpha: torch.Tensor,
+        background: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        real, pixels = real_of(plain), plain.shape[0] * plain.shape[1]
         image, textured = torch.empty_like(plain), torch.empty_like(plain)
         outputs = [array(x.view(-1, 3), types(real).vec3) for x in (image, textured)]
-        launch(
-            plain, compose_kernels(real).forward, plain.shape[0] * plain.shape[1], _arrays(real, list(inputs)), outputs
-        )
-        ctx.save_for_backward(*inputs[2:])  # type: ignore[arg-type]  # never None: only base is
+        inputs = _arrays(real, [plain, base, colors, weights, alpha, background[None, None]])
+        launch(plain, compose_kernels(real).forward, pixels, inputs, outputs)
+        ctx.save_for_backward(colors, weights, alpha, background)
         ctx.set_materialize_grads(False)
         return image, textured
 
@@ -75,7 +73,7 @@ class _Compose(torch.autograd.Function):
         shapes = ((*alpha.shape, 3), colors.shape, weights.shape, alpha.shape)
         grads = [weights.new_empty(s) if need else None for s, need in zip(shapes, needed, strict=True)]
         signals = [None if x is None else x.contiguous() for x in (grad_image, grad_textured)]
-        _, _, *inputs = _arrays(real, [None, None, colors, weights, None, background])
+        _, _, *inputs = _arrays(real, [None, None, colors, weights, None, background[None, None]])
         incoming = [array(None if x is None else x.view(-1, 3), types(real).vec3) for x in signals]
         _, *outputs, _ = _arrays(real, [None, *grads, None])
         launch(weights, compose_kernels(real).backward, alpha.numel(), [*inputs[:2], inputs[3], *incoming], outputs)

@@ -35,7 +35,7 @@ class _Unproject(torch.autograd.Function):
         positions = depths.new_empty(*depths.shape, 3)
         directions = depths.new_empty(*depths.shape[:2], 3)
         kernel, pixels = unproject_kernels(real_of(depths)).forward, depths.shape[0] * depths.shape[1]
-        launch(depths, kernel, pixels, _inputs(depths, viewmat, camera), _outputs(depths, positions, directions))
+        launch(depths, kernel, pixels, _inputs(depths, viewmat, camera), _outputs(positions, directions))
         ctx.save_for_backward(depths, viewmat)
         ctx.camera = camera
         ctx.set_materialize_grads(False)
@@ -57,28 +57,20 @@ class _Unproject(torch.autograd.Function):
         grad_depths = torch.empty_like(depths) if need_depths else None
         # A slot a pixel, then one sum: no contention, and a fixed order.
         grad_viewmats = viewmat.new_empty(pixels, 4, 4) if need_viewmat else None
-        grads = (None if x is None else x.contiguous() for x in (grad_positions, grad_directions))
-        inputs = [*_inputs(depths, viewmat, ctx.camera), *_outputs(depths, *grads)]
-        outputs = [array(_rows(grad_depths), real), array(grad_viewmats, types(real).mat44)]
+        inputs = [*_inputs(depths, viewmat, ctx.camera), *_outputs(grad_positions, grad_directions)]
+        flat = None if grad_depths is None else grad_depths.flatten(0, 1)
+        outputs = [array(flat, real), array(grad_viewmats, types(real).mat44)]
         launch(depths, unproject_kernels(real).backward, pixels, inputs, outputs)
         return grad_depths, None if grad_viewmats is None else grad_viewmats.sum(0), None
-
-
-def _rows(depths: torch.Tensor | None) -> torch.Tensor | None:
-    return None if depths is None else depths.view(depths.shape[0] * depths.shape[1], depths.shape[2])
 
 
 def _inputs(depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole) -> list[Argument]:
     t = types(real_of(depths))
     K = array(camera.K.contiguous()[None], t.mat33)
-    return [array(_rows(depths), t.real), array(viewmat[None], t.mat44), K, camera.width]
+    return [array(depths.flatten(0, 1), t.real), array(viewmat[None], t.mat44), K, camera.width]
 
 
-def _outputs(depths: torch.Tensor, positions: torch.Tensor | None, directions: torch.Tensor | None) -> list[Argument]:
-    """View positions and directions, or their gradients, as the kernels do."""
-    vec3, pixels = types(real_of(depths)).vec3, depths.shape[0] * depths.shape[1]
-    shapes = ((pixels, depths.shape[2], 3), (pixels, 3))
-    return [
-        array(None if x is None else x.view(shape), vec3)
-        for x, shape in zip((positions, directions), shapes, strict=True)
-    ]
+def _outputs(positions: torch.Tensor | None, directions: torch.Tensor | None) -> list[Argument]:
+    """View positions and directions, or their gradients, as the kernels do: one row a pixel."""
+    given = [None if x is None else x.contiguous().flatten(0, 1) for x in (positions, directions)]
+    return [None if x is None else array(x, types(real_of(x)).vec3) for x in given]
