@@ -43,6 +43,11 @@ def model_of(device: torch.device, *, finished: bool = True) -> tuple[nw.Model, 
     return nw.Model(surfels, make_texture(device=device), exposures, limits), camera
 
 
+def texture_of(model: nw.Model) -> nw.NeuralTexture:
+    assert isinstance(model.texture, nw.NeuralTexture)
+    return model.texture
+
+
 def gradients(model: nw.Model, camera: nw.Camera) -> dict[str, torch.Tensor]:
     """Render, differentiate and return the gradients of all parameters and of the camera."""
     model.zero_grad()
@@ -102,7 +107,7 @@ def test_autocast_changes_nothing(dtype, finished, device):
     """The backward pass inside of the region, too: on CUDA, torch differentiates the camera's matrix in half there."""
     model, camera = model_of(device, finished=finished)
     for half in (True, False):
-        present(model.texture).half_precision = half  # of the MLP on CUDA
+        texture_of(model).half_precision = half  # of the MLP on CUDA
         expected, wanted = model.render(camera, background=BACKGROUND), gradients(model, camera)
         with torch.autocast(device.type, dtype=dtype):
             out = model.render(camera, background=BACKGROUND)
@@ -137,7 +142,7 @@ def test_parameters_in_half_precision_are_refused(dtype, device):
     with pytest.raises(TypeError, match=f"^surfels: expected float32 or float64 .*, got {dtype}"):
         copy.deepcopy(model).to(dtype).render(camera)
     with pytest.raises(TypeError, match=f"^texture.grid: expected dtype torch.float32, got {dtype}"):
-        nw.render(model.surfels, copy.deepcopy(present(model.texture)).to(dtype), camera)
+        nw.render(model.surfels, copy.deepcopy(texture_of(model)).to(dtype), camera)
 
 
 # Transforms: the table of docs/python.md, row by row
@@ -176,9 +181,9 @@ def test_compiled_code_calls_a_rendering_as_it_is(name, device):
 def test_second_derivatives_raise(device):
     """Of every parameter, whether all gradients or one alone are asked for; never a constant without a word."""
     model, camera = model_of(device, finished=False)
-    for x in (*model.surfels.parameters(), present(model.texture).grid, camera.viewmat):
+    for x in (*model.surfels.parameters(), texture_of(model).grid, camera.viewmat):
         out = model.render(camera)
-        total = out.image.sum() if x is present(model.texture).grid else out.image.sum() + out.expected_depth.sum()
+        total = out.image.sum() if x is texture_of(model).grid else out.image.sum() + out.expected_depth.sum()
         (grad,) = torch.autograd.grad(total, x, create_graph=True)
         with pytest.raises(RuntimeError, match=SECOND):
             torch.autograd.grad(grad.sum(), x, retain_graph=True)
