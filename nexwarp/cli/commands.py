@@ -13,6 +13,7 @@ from nexwarp.cli.device import pick_device
 from nexwarp.cli.display import describe_exposures, device_name
 from nexwarp.cli.eval import figures
 from nexwarp.cli.options import Device_, Preset_, Run_, check_max_hits, option
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.run import warmup
 from nexwarp.run.export import ExportOrder, export_run
 from nexwarp.run.folder import RENDERS_FOLDER, read_metrics
@@ -106,7 +107,7 @@ class Info:
 def _describe_model(opened: OpenedModel) -> dict[str, str]:
     """Summarise a model as rows of a table."""
     model = opened.model
-    texture = None if model.texture is None else model.texture.config
+    texture = model.texture.config if isinstance(model.texture, NeuralTexture) else None
     budget = "" if opened.config is None else f" (budget {opened.config.max_surfels:,})"
     return {
         "surfels": f"{len(model.surfels):,}{budget}",

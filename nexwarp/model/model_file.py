@@ -53,11 +53,8 @@ def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = Fa
 
     tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}
     shape = _texture_record(model.texture)
-    if shape is not None and KIND in shape:
-        tensors |= {f"{OWN}{name}": x for name, x in model.texture.state_dict().items()}
-    elif model.texture is not None:
-        for name, x in model.texture.state_dict().items():
-            tensors[f"texture.{name}"] = x.clone() if name == "resolutions" else x.half()
+    for name, x in _stored_state(model.texture).items():
+        tensors[name] = x.clone() if name.startswith(OWN) or name == "texture.resolutions" else x.half()
     if model.detail_limits is not None:
         tensors |= {stored: getattr(model.detail_limits, name) for name, stored in DETAIL_LIMITS.items()}
     if model.exposures is not None:

@@ -43,13 +43,13 @@ def check_start(scene: Scene, config: Config, start: Start) -> None:
         if name != "texture" and value is not None and not isinstance(value, Surfels if name == "surfels" else Model):
             kind = "Surfels" if name == "surfels" else "Model"
             raise TypeError(f"{name}: expected a nexwarp.{kind} or None, got {type(value).__name__}")
-    surfels, init, texture = (start.get(name) for name in ("surfels", "init", "texture"))
+    surfels, init, texture = start.get("surfels"), start.get("init"), start.get("texture")
     if surfels is not None and init is not None:
         raise ValueError("init: expected None with surfels, which are the model's otherwise")
-    if isinstance(init, Model):
+    if init is not None:
         check_scale("init", init, scene)
         surfels = init.surfels
-    if isinstance(surfels, Surfels):
+    if surfels is not None:
         if not 1 <= len(surfels) <= config.max_surfels:
             raise ValueError(f"surfels: expected 1 to max_surfels, {config.max_surfels:,}, got {len(surfels):,}")
         check_bounds({f"surfels.{name}": x.detach() for name, x in surfels.named_parameters()})
@@ -72,9 +72,11 @@ def check_scale(name: str, model: Model, scene: Scene) -> None:
 def given_surfels(config: Config, start: Start) -> Surfels | None:
     """Return a copy of the surfels to start from, with the SH coefficients of the run; None where none are given."""
     init, surfels = start.get("init"), start.get("surfels")
-    if surfels is None and init is None:
+    if init is not None:
+        surfels = init.surfels
+    if surfels is None:
         return None
-    raw = {name: x.detach().float().clone() for name, x in (surfels or init.surfels).state_dict().items()}
+    raw = {name: x.detach().float().clone() for name, x in surfels.state_dict().items()}
     rest = raw["shN"][:, : (config.sh_degree + 1) ** 2 - 1]
     raw["shN"] = torch.nn.functional.pad(rest, (0, 0, 0, (config.sh_degree + 1) ** 2 - 1 - rest.shape[1]))
     return Surfels(raw)

@@ -71,8 +71,8 @@ def step_losses(
     )
     if factors.opacity > 0:
         losses["opacity"] = factors.opacity * state.surfels.opacities.mean()
-    neural = isinstance(texture, NeuralTexture) and config.max_hits > 0
-    if neural and factors.grid > 0 and not isinstance(state.optimizer, FusedAdam):
+    regular = config.max_hits > 0 and factors.grid > 0 and not isinstance(state.optimizer, FusedAdam)
+    if regular and isinstance(texture, NeuralTexture):
         losses["grid"] = factors.grid * grid_loss(texture.grid, texture.resolutions * state.cells_unit)
     if target.empty is not None and factors.empty > 0:
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()

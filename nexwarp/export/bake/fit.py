@@ -7,11 +7,13 @@ import torch
 
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
+from nexwarp.errors import FormatError
 from nexwarp.export.bake.baked import Baked, mean_colors, sample
 from nexwarp.export.bake.layout import Layout, lay_out
 from nexwarp.export.bake.observe import Observations, axes, hits_of, observe, untextured
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NeuralTexture
 
 WINDOW = 256  # largest width and height that one step renders
 PASSES = 2.0  # over the views' pixels
@@ -41,17 +43,20 @@ def evaluate(model: Model, seen: Observations, layout: Layout) -> torch.Tensor:
     What is added to a plain colour is weighted by the fraction of the surfel that is textured.
     """
     atlas = model.surfels.means.new_zeros(layout.height, layout.width, 3)
-    if model.texture is None or model.options.max_hits == 0:
+    texture = model.texture
+    if texture is None or model.options.max_hits == 0:
         return atlas
+    if not isinstance(texture, NeuralTexture):
+        raise FormatError(f"texture: expected a nexwarp.NeuralTexture to bake, got {type(texture).__name__}")
     surfels, degree = model.surfels, model.options.sh_degree
-    plain = None if model.texture.residual else mean_colors(surfels, seen, degree)
+    plain = None if texture.residual else mean_colors(surfels, seen, degree)
     # A pixel of the closest view, in world units: levels of finer cells fade as they do there.
     sizes = (surfels.scales / seen.pixels.clamp_min(1e-12)).amin(1)
     for places, ids, local in layout.centres():
         offsets = (local * surfels.scales[ids]).unbind(1)
         sides = axes(surfels)
         points = surfels.means[ids] + sum(x[:, None] * axis[ids] for x, axis in zip(offsets, sides, strict=True))
-        colors = model.texture.evaluate(
+        colors = texture.evaluate(
             points[:, None],
             sizes[ids, None],
             seen.directions[ids],

@@ -40,13 +40,17 @@ class SceneData:
             raise FormatError(f"model: expected at most {LARGEST_SURFELS:,} surfels, got {len(surfels):,}")
         if options.order != "depth":
             raise FormatError(f"order: expected depth, which the web page draws, got {options.order}")
+        texture = model.texture if options.max_hits else None
+        if not isinstance(texture, NeuralTexture | None):
+            name = type(texture).__name__
+            raise FormatError(f"texture: expected a nexwarp.NeuralTexture, which the web page draws, got {name}")
         limits = model.detail_limits if options.detail_limits else None
         return cls(
             **{name: array_of(x) for name, x in surfels.activated()._asdict().items()},
             limits=None if limits is None else array_of(torch.stack([limits.nearest, limits.farthest], 1)),
             sh=array_of(surfels.sh),
             options=options,
-            texture=model.texture if options.max_hits else None,
+            texture=texture,
             exposures=_exposures(model.exposures) if options.exposure == "photos" else None,
         )
 
