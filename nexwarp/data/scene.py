@@ -209,7 +209,7 @@ def load_scene(
     name. More in docs/scenes.md.
 
     Args:
-        path: folder of the scene.
+        path: folder of the scene; "demo" is the built-in one.
         images: folder of the photos, inside `path`.
         downscale: average blocks of this many pixels squared; what fills no block is cropped.
         progress: called with the number of photos read and their total, from one thread at a time.
@@ -233,7 +233,7 @@ def load_scene(
     """
     source = SceneSource(path, images, downscale, **options)  # type: ignore[arg-type]  # checked below
     _check_types(source)
-    return _read_scene(source, Path(path), progress)
+    return source.load(progress)
 
 
 def _check_types(source: SceneSource) -> None:
