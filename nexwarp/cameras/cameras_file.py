@@ -27,20 +27,21 @@ def save_cameras(
 
     `before` are the same cameras before their poses were refined; those that differ are written, too.
     """
-    data: dict[str, Any] = {}
+    data: dict[str, object] = {}
     origins = {camera.origin or WORLD for members in cameras.values() for camera in members.values()}
     if len(origins) > 1:
         raise ValueError(f"cameras: expected one origin, got {len(origins)}")
     if origins - {WORLD}:
         data["origin"] = list(*origins)
     for group, members in cameras.items():
-        data[group] = {}
+        entries: dict[str, dict[str, object]] = {}
         for name, camera in members.items():
-            entry: dict[str, Any] = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
+            entry: dict[str, object] = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
             entry |= {"width": camera.width, "height": camera.height, "near": camera.near}
             if before is not None and not torch.equal(before[group][name].viewmat.cpu(), camera.viewmat.cpu()):
                 entry["given_viewmat"] = before[group][name].viewmat.tolist()
-            data[group][name] = entry
+            entries[name] = entry
+        data[group] = entries
     write_json(path, data)
 
 
@@ -86,7 +87,7 @@ def _file_name(name: str) -> str:
     return name
 
 
-def origin_of(data: Mapping[str, Any]) -> tuple[float, float, float] | None:
+def origin_of(data: Mapping[str, object]) -> tuple[float, float, float] | None:
     """Read the key `origin` of a model's or a file's frame; None where there is none.
 
     Raises:
@@ -95,8 +96,11 @@ def origin_of(data: Mapping[str, Any]) -> tuple[float, float, float] | None:
     values = data.get("origin")
     if values is None:
         return None
-    numbers = isinstance(values, list) and all(type(value) in (int, float) for value in values)
-    if not numbers or len(values) != 3 or not all(abs(value) <= LARGEST_DISTANCE for value in values):
+    if (
+        not isinstance(values, list)
+        or len(values) != 3
+        or not all(type(value) in (int, float) and abs(value) <= LARGEST_DISTANCE for value in values)
+    ):
         raise ValueError(f"origin: expected three numbers, got {one_line(values, 60)}")
     x, y, z = map(float, values)
     return x, y, z

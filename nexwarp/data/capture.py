@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any
 
 import numpy as np
 
@@ -96,7 +95,14 @@ class Capture:
     background: tuple[float, float, float] | None = None
 
     @classmethod
-    def of(cls, source: Path, photos: list[Photo], cloud: Cloud | None, **more: Any) -> "Capture":
+    def of(
+        cls,
+        source: Path,
+        photos: list[Photo],
+        cloud: Cloud | None,
+        test: frozenset[str] | None = None,
+        background: tuple[float, float, float] | None = None,
+    ) -> "Capture":
         """Sort photos by name, and move photos and cloud from the world frame to one near them where that is needed."""
         photos = sorted(photos, key=lambda photo: photo.name)
         cloud = cloud if cloud is not None and len(cloud.positions) else None
@@ -105,7 +111,7 @@ class Capture:
         if origin.any():
             photos = [dataclasses.replace(photo, viewmat=moved(photo.viewmat, origin)) for photo in photos]
             cloud = cloud and cloud.moved(origin)
-        return cls(source, photos, cloud, origin, **more)
+        return cls(source, photos, cloud, origin, test, background)
 
 
 def far_origin(viewmats: Sequence[np.ndarray], size: int, cloud: Cloud | None) -> np.ndarray:

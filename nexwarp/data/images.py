@@ -3,10 +3,10 @@
 import io
 import os
 import warnings
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -131,15 +131,14 @@ def _loaded(path: Path) -> Iterator["PIL.Image.Image"]:
             6: Transpose.ROTATE_90,
             7: Transpose.TRANSVERSE,
             8: Transpose.ROTATE_270,
-        }.get(orientation)
+        }.get(orientation or 0)
         stored = image if undo is None else image.transpose(undo)
-        yield _full_range(stored, getattr(image, "tag_v2", {}))
+        tags = getattr(image, "tag_v2", {})
+        yield _full_range(stored, tags.get(BITS, (16,))[0], tags.get(PHOTOMETRIC) == WHITE_IS_ZERO)
 
 
-def _full_range(image: "PIL.Image.Image", tags: Mapping[int, Any]) -> "PIL.Image.Image":
+def _full_range(image: "PIL.Image.Image", bits: int, inverted: bool) -> "PIL.Image.Image":
     """Return 16-bit grey with black as 0 and white as 65535; PIL leaves 12 bits and inverted values of TIFF files."""
-    bits = int(tags.get(BITS, (16,))[0])
-    inverted = tags.get(PHOTOMETRIC) == WHITE_IS_ZERO
     if not image.mode.startswith("I;16") or (bits == 16 and not inverted):
         return image
     from PIL import Image
