@@ -32,6 +32,9 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "fixed_point": (False, True),
     "by_place": (False,),  # True is for CPUs
     "wide": (False, True),
+    "outputs": (64,),
+    "inputs": (32,),
+    "rectified": (False, True),
 }
 ALL = VALUES | {"max_hits": tuple(range(MAX_HITS + 1)), "degree": (0, 1, 2, 3), "features": (1, 2, 4, 8)}
 # Their atomics depend on the architecture.

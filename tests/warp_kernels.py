@@ -38,22 +38,6 @@ def add_in_order(
 
 
 @wp.kernel(module="unique")
-def matmul(weights: wp.array2d(dtype=REAL), x: wp.array2d(dtype=REAL), y: wp.array2d(dtype=REAL)):
-    o, i = wp.tid()
-    total = REAL(0.0)
-    for k in range(weights.shape[1]):
-        total += weights[o, k] * x[k, i]
-    y[o, i] = total
-
-
-# A kernel of its own: Warp's adjoint does not replay the sum's dynamic loop, so a max behind it would see zeros.
-@wp.kernel(module="unique")
-def relu(x: wp.array2d(dtype=REAL), y: wp.array2d(dtype=REAL)):
-    o, i = wp.tid()
-    y[o, i] = wp.max(x[o, i], REAL(0.0))
-
-
-@wp.kernel(module="unique")
 def weighted_sum(
     image: wp.array(dtype=types(REAL).vec3), weights: wp.array(dtype=types(REAL).vec3), loss: wp.array(dtype=REAL)
 ):

@@ -1,12 +1,12 @@
 """The passes for Warp programs: each records itself on a `wp.Tape`; `tape.backward()` differentiates a render.
 
 Arrays are Warp arrays of one scalar type (float32 or float64) on one device; what is to receive gradients is made with
-`requires_grad=True`. Outputs own gradients. Each pass calls the torch op of its name with views of the arrays, on
-Warp's stream, and records the op's derivative. What `nexwarp.model.render` adds for trained models is not here:
-exposures and detail limits.
+`requires_grad=True`. Outputs own gradients. `mlp` is a Warp kernel, which Warp differentiates. Each other pass calls
+the torch op of its name with views of the arrays, on Warp's stream, and records the op's derivative. What
+`nexwarp.model.render` adds for trained models is not here: exposures and detail limits.
 
     tape = wp.Tape()
-    records, centers, limits = project(tape, ...)
+    quats, scales, opacities, gammas = activate(tape, ...)
     ...
     tape.backward(loss)
 """
@@ -20,6 +20,7 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from nexwarp import ops
+from nexwarp.kernels.mlp import POINTS, THREADS, layer_kernel
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import Context, array, launch, real_of
 from nexwarp.ops.collect import Walked
@@ -85,7 +86,7 @@ def _record(
 ) -> list[wp.array]:
     """Call a torch op with views of arrays; return its outputs as arrays of these types and record its derivative."""
     device = next(x.device for x in inputs if x is not None)
-    leaves = [x and _tensor(x).detach().requires_grad_(x.requires_grad) for x in inputs]
+    leaves = [None if x is None else _tensor(x).detach().requires_grad_(x.requires_grad) for x in inputs]
     with _on_stream(device), torch.enable_grad():
         outputs = op(*leaves)
     results = [
@@ -110,19 +111,29 @@ def _record(
     return results
 
 
+def activate(
+    tape: wp.Tape, raw_quats: wp.array, log_scales: wp.array, logit_opacities: wp.array, raw_gammas: wp.array
+) -> tuple[wp.array, wp.array, wp.array, wp.array]:
+    """Activated quats (N) vec4, scales (N) vec2, opacities (N) and gammas (N) vec2 of raw ones, see `Surfels`."""
+    raw = [raw_quats, log_scales, logit_opacities, raw_gammas]
+    quats, scales, opacities, gammas = _record(tape, ops.activate, raw, [x.dtype for x in raw])
+    return quats, scales, opacities, gammas
+
+
 def plain_colors(
-    tape: wp.Tape, sh: wp.array | tuple[wp.array, wp.array], means: wp.array, position: wp.array, degree: int
+    tape: wp.Tape, sh: wp.array | tuple[wp.array, wp.array], means: wp.array, viewmat: wp.array, degree: int
 ) -> wp.array:
-    """Plain colours (N) vec3 of sh (N, C) vec3, means (N) vec3 and the camera's position (1) vec3, world.
+    """Plain colours (N) vec3 of sh (N, C) vec3 and means (N) vec3, as seen by a camera; viewmat is (1) mat44.
 
     `sh` may come apart, as (N, 1) and (N, C - 1) vec3; `degree` is at most that of the C coefficients.
     """
 
-    def op(means: torch.Tensor, position: torch.Tensor, *sh: torch.Tensor) -> list[torch.Tensor]:
-        return [ops.plain_colors(sh[0] if len(sh) == 1 else (sh[0], sh[1]), means, position[0], degree)]
+    def op(means: torch.Tensor, viewmat: torch.Tensor, *sh: torch.Tensor) -> list[torch.Tensor]:
+        position = -(viewmat[0, :3, :3] * viewmat[0, :3, 3:]).sum(0)
+        return [ops.plain_colors(sh[0] if len(sh) == 1 else (sh[0], sh[1]), means, position, degree)]
 
     parts = [sh] if isinstance(sh, wp.array) else sh
-    return _record(tape, op, [means, position, *parts], [means.dtype])[0]
+    return _record(tape, op, [means, viewmat, *parts], [means.dtype])[0]
 
 
 def project(
@@ -219,11 +230,43 @@ class _Encode(torch.autograd.Function):
 
 
 def hashgrid(
-    tape: wp.Tape, table: wp.array, positions: wp.array, depths: wp.array, resolutions: wp.array, focal: wp.array
+    tape: wp.Tape, table: wp.array, positions: wp.array, depths: wp.array, resolutions: wp.array, image: Image
 ) -> wp.array:
-    """Features (L * F, n) of table (L, T) vecF at positions (n) vec3 seen at depths (n); focal is (1)."""
-    inputs = [table, positions, depths, resolutions, focal]
-    return _record(tape, lambda *tensors: [_Encode.apply(*tensors)], inputs, [depths.dtype])[0]
+    """Features (L * F, n) of table (L, T) vecF at positions (P, K) vec3 seen at depths (P, K), n = P * K.
+
+    `resolutions` (L) are cells in a world unit.
+    """
+    fx, fy, _, _ = image.intrinsics
+
+    def op(
+        table: torch.Tensor, positions: torch.Tensor, depths: torch.Tensor, resolutions: torch.Tensor
+    ) -> list[torch.Tensor]:
+        focal = depths.new_tensor([(fx * fy) ** 0.5])
+        return [_Encode.apply(table, positions.flatten(0, 1), depths.flatten(), resolutions, focal)]
+
+    return _record(tape, op, [table, positions, depths, resolutions], [depths.dtype])[0]
+
+
+def mlp(tape: wp.Tape, matrices: Sequence[wp.array], features: wp.array) -> wp.array:
+    """Outputs (out, n) of features (in, n) by matrices (out, in) of layers, with a ReLU between two of them.
+
+    A matrix of 64 x 64 fits the shared memory of all GPUs in float32; in float64 it needs 128 KiB.
+    """
+    count = features.shape[1]
+    for i, matrix in enumerate(matrices):
+        inputs, shape = features, (matrix.shape[0], count)
+        features = wp.empty(shape, dtype=inputs.dtype, device=inputs.device, requires_grad=True)
+        kernel = layer_kernel(inputs.dtype, *matrix.shape, i > 0)
+        with tape:
+            wp.launch_tiled(
+                kernel,
+                dim=[-(-count // POINTS)],
+                inputs=[matrix, inputs],
+                outputs=[features],
+                block_dim=THREADS,
+                device=inputs.device,
+            )
+    return features
 
 
 class _Colors(torch.autograd.Function):
@@ -254,7 +297,10 @@ def textured_colors(
     clamp: bool = False,
     offset: float = 0.5,
 ) -> wp.array:
-    """Colours offset + SH (n) vec3 of coefficients (3 (degree + 1)^2, n) along directions (P) vec3, n = P * K."""
+    """Colours offset + SH (n) vec3 of coefficients (3 (degree + 1)^2, n) along directions (P) vec3, n = P * K.
+
+    The offset of a residual texture is 0.
+    """
 
     def op(coefficients: torch.Tensor, directions: torch.Tensor) -> list[torch.Tensor]:
         rays = Rays(directions.detach(), offset, clamp)
@@ -272,11 +318,18 @@ def compose(
     background: wp.array,
     base: wp.array | None = None,
 ) -> tuple[wp.array, wp.array]:
-    """Image and textured, (P) vec3 each, of plain and base (P) vec3, colors (P, K) vec3, weights (P, K), alphas (P)."""
+    """Image and textured, (P) vec3 each, of plain and base (P) vec3, colors (P * K) vec3, weights (P, K), alphas (P).
+
+    `base`, of residual textures, is added to `textured`; background is (1) vec3.
+    """
 
     def op(*tensors: torch.Tensor) -> list[torch.Tensor]:
-        *images, background, base = (x if x is None else x[None] for x in tensors)
-        return [x[0] for x in ops.compose(*images, background[0, 0], base)]
+        plain, colors, weights, alphas, background, base = tensors
+        slots = (colors.view(1, *weights.shape, 3), weights[None])
+        return [
+            x[0]
+            for x in ops.compose(plain[None], *slots, alphas[None], background[0], None if base is None else base[None])
+        ]
 
     image, textured = _record(tape, op, [plain, colors, weights, alphas, background, base], [plain.dtype, plain.dtype])
     return image, textured

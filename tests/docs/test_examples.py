@@ -62,7 +62,7 @@ def size_of(path: Path) -> tuple[int, int]:
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_are_short_and_tell_how_to_run_them(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    assert text.count("\n") < (60 if path.stem != "read_model" else 230)
+    assert text.count("\n") < {"read_model": 230, "tape": 115}.get(path.stem, 60)
     assert f"\npython examples/{path.name} " in text.split('"""')[1]
 
 
@@ -98,6 +98,11 @@ def test_the_own_loss_falls() -> None:
     out = run("own_loss", "--steps", 60)
     first, first_psnr, last, last_psnr = numbers(r"edge loss ([\d.]+), ([\d.]+) dB", out)
     assert last < first and last_psnr > first_psnr
+
+
+def test_the_loss_falls_by_the_tape_alone() -> None:
+    first, last = numbers(r"loss ([\d.]+)", run("tape", "--steps", 100))
+    assert last < 0.5 * first
 
 
 def test_the_pose_is_recovered(model: Path) -> None:

@@ -1,64 +1,92 @@
 """A Warp-only program differentiates a whole render with `tape.backward()`, and agrees with torch's gradients."""
 
+import dataclasses
 from typing import Any
 
-import pytest
 import torch
 import warp as wp
 
 import nexwarp as nw
+from examples import tape as example
 from nexwarp import ops
-from nexwarp.kernels.types import types
+from nexwarp.model.surfels import PARAMETERS
 from nexwarp.ops import tape as passes
 from tests.narrowing import present
-from tests.scenes import CAMERA_KEYS, SURFEL_KEYS, random_scene
+from tests.scenes import CAMERA_KEYS, SURFEL_KEYS, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
-from tests.warp_kernels import REAL, matmul, relu, weighted_sum
+from tests.warp_kernels import REAL, weighted_sum
 
 HITS = 2
 
 
-def to_warp(tensor: torch.Tensor, dtype: type) -> "wp.array[Any]":
-    array = wp.from_torch(tensor.detach().clone().contiguous(), dtype=dtype, requires_grad=True)
-    assert isinstance(array, wp.array)
-    return array
-
-
-@pytest.mark.parametrize("residual", [False, True])
-def test_tape_and_torch_give_the_same_gradients(residual: bool, device: torch.device) -> None:
+def test_tape_and_torch_give_the_same_gradients_of_a_nexel(device: torch.device) -> None:
+    """From the raw parameters to the loss: of every parameter, weight and the camera's pose."""
     scene = random_scene(dtype=torch.float64, device=device, off_centre=True)
-    surfels = nw.Surfels.from_activated(*(scene[key] for key in SURFEL_KEYS))
+    surfels, texture = make_surfels(scene), make_texture(dtype=torch.float64, device=device)
+    texture.half_precision = False
     viewmat = scene["viewmat"].clone().requires_grad_()
     camera = nw.Camera(**{key: scene[key] for key in CAMERA_KEYS} | {"viewmat": viewmat})
-    torch.manual_seed(1)
-    texture = nw.NeuralTexture(3, 2**8, min_resolution=1.0, max_resolution=4.0, width=8, residual=residual)
-    texture = texture.to(device=device, dtype=torch.float64)
-    with torch.no_grad():
-        texture.grid.uniform_(-1, 1)
-    background = torch.tensor([0.1, 0.5, 0.3], dtype=torch.float64, device=device)
+    x = example.parameters_of(surfels, texture)
+    view, resolutions = example.array(viewmat[None], 2), example.array(texture.resolutions.double())
+    tape, loss = wp.Tape(), wp.zeros(1, dtype=REAL, device=view.device, requires_grad=True)
+    image = example.draw(tape, x, resolutions, camera, view)
     weights = torch.randn(camera.height, camera.width, 3, dtype=torch.float64).to(device)
+    with tape:
+        cotangent = example.array(weights.view(-1, 3), 1)
+        wp.launch(weighted_sum, len(image), inputs=[image, cotangent], outputs=[loss], device=image.device)
+    tape.backward(loss)
 
-    activated = {key: getattr(surfels, key).detach().requires_grad_() for key in SURFEL_KEYS}
-    out = nw.render(surfels, texture, camera, HITS, background)
+    out = nw.render(surfels, texture, camera, HITS)
     (out.image * weights).sum().backward()
-    # Torch's gradients with respect to the activated values: through the activations, by the chain rule's other side.
-    loss, gradients, image = warp_program(activated, texture, viewmat, camera, background, weights)
-    for name, value in activated.items():
-        value.grad = gradients.pop(name)
-    rebuilt = {key: getattr(surfels, key) for key in SURFEL_KEYS}
-    named = dict(surfels.named_parameters())
-    through = torch.autograd.grad(
-        [rebuilt[key] for key in SURFEL_KEYS], list(named.values()), [activated[key].grad for key in SURFEL_KEYS]
-    )
-    assert_close(image, out.image, kind="value", name="image")
-    assert_close(loss, (out.image * weights).sum(), kind="value", name="loss")
-    for (name, parameter), gradient in zip(named.items(), through, strict=True):
-        assert_close(gradient, present(parameter.grad), kind="gradient", name=name)
-    assert_close(gradients["grid"], present(texture.grid.grad), kind="gradient", name="grid")
-    for index, matrix in enumerate(texture.mlp.parameters()):
-        assert_close(gradients[f"mlp{index}"], present(matrix.grad), kind="gradient", name=f"mlp{index}")
-    position = torch.autograd.grad(camera.position, viewmat, gradients["position"])[0]
-    assert_close(gradients["viewmat"] + position, present(viewmat.grad), kind="gradient", name="viewmat")
+    assert_close(wp.to_torch(image).view_as(out.image), out.image, kind="value", name="image")
+    parameters = dict(surfels.named_parameters()) | {"grid": texture.grid}
+    parameters |= {f"mlp{i}": matrix for i, matrix in enumerate(texture.mlp.parameters())}
+    assert x.keys() == parameters.keys() >= set(PARAMETERS)
+    for name, parameter in parameters.items():
+        assert present(parameter.grad).abs().max() > 0, name
+        assert_close(wp.to_torch(x[name].grad), present(parameter.grad), kind="gradient", name=name)
+    assert_close(wp.to_torch(view.grad)[0], present(viewmat.grad), kind="gradient", name="viewmat")
+
+
+def test_residual_colors_are_composed_with_the_plain_ones(device: torch.device) -> None:
+    """`base` goes through the tape, too."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = ((7, 3), (14, 3), (7, 2), (7,), (1, 3), (7, 3))
+    tensors = [torch.rand(*shape, generator=generator, dtype=torch.float64).to(device) for shape in shapes]
+    leaves = [x.requires_grad_() for x in tensors]
+    plain, colors, weights, alphas, background, base = leaves
+    slots = (colors.view(1, 7, 2, 3), weights[None])
+    expected, _ = ops.compose(plain[None], *slots, alphas[None], background[0], base[None])
+    expected.square().sum().backward()
+    arrays = [example.array(x, int(x.shape[-1] == 3)) for x in leaves]
+    tape = wp.Tape()
+    image, _ = passes.compose(tape, *arrays)
+    tape.backward(grads={image: example.array(2 * expected[0], 1)})
+    for array, leaf in zip(arrays, leaves, strict=True):
+        assert_close(wp.to_torch(array.grad), present(leaf.grad), kind="gradient", name="compose")
+
+
+def test_training_by_the_tape_alone_falls_in_loss_as_by_torch(tiny_scene: nw.Scene, device: torch.device) -> None:
+    """100 steps with Adam from the same parameters; torch's start tells how much two trainings may differ."""
+    torch.manual_seed(0)
+    surfels, texture = example.start(tiny_scene)
+    surfels, texture = surfels.to(device), texture.to(device)
+    texture.half_precision = False
+    views = [dataclasses.replace(view, camera=view.camera.to(device)) for view in tiny_scene.train]
+    x = example.parameters_of(surfels, texture)
+    losses = example.train(x, example.array(texture.resolutions), views, 100)
+    optimizer, expected = torch.optim.Adam([*surfels.parameters(), *texture.parameters()], lr=example.RATE), []
+    for step in range(100):
+        view = views[step % len(views)]
+        loss = (nw.render(surfels, texture, view.camera).image - view.image.to(device) / 255.0).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        expected.append(loss.item())
+    actual, wanted = torch.tensor(losses), torch.tensor(expected)
+    assert (actual / wanted - 1)[:10].abs().max() < 1e-3
+    assert wanted[-20:].mean() < 0.5 * wanted[:20].mean()
+    assert abs(actual[-20:].mean() / wanted[-20:].mean() - 1) < 0.05
 
 
 def test_tape_and_torch_give_the_same_gradients_of_a_surface(device: torch.device) -> None:
@@ -78,89 +106,18 @@ def test_tape_and_torch_give_the_same_gradients_of_a_surface(device: torch.devic
     cotangents = [torch.randn_like(x) for x in buffers]
     torch.autograd.backward(buffers, cotangents)
 
-    t, tape = types(REAL), wp.Tape()
-    shape = (
-        to_warp(means, t.vec3),
-        to_warp(quats, t.vec4),
-        to_warp(scales, t.vec2),
-        to_warp(opacities, REAL),
-        to_warp(gammas, t.vec2),
-    )
-    view, colors = to_warp(viewmat[None], t.mat44), to_warp(torch.zeros_like(scene["means"]), t.vec3)
+    tape = wp.Tape()
+    shape: Any = [example.array(x, x.ndim - 1) for x in given]
+    view, colors = example.array(viewmat[None], 2), example.array(torch.zeros_like(scene["means"]), 1)
     image = passes.Image((camera.fx, camera.fy, camera.cx, camera.cy), (camera.width, camera.height), camera.near)
-    records, centers, limits = passes.project(tape, *shape, colors, view)
-    lists = passes.intersect_tiles(*shape, centers, view, image)
+    records, centers, limits = passes.project(tape, *shape, colors=colors, viewmat=view)
+    lists = passes.intersect_tiles(*shape, centers=centers, viewmat=view, image=image)
     stops = passes.collect(tape, records, limits, lists, image, HITS).stops
     surface = passes.surface(tape, records, limits, lists, image, stops)
     for buffer, expected in zip(surface, buffers, strict=True):
         assert_close(wp.to_torch(buffer).view_as(expected), expected, kind="value", name="buffer")
-    grads = {
-        buffer: to_warp(x.view(-1, *x.shape[2:]), buffer.dtype) for buffer, x in zip(surface, cotangents, strict=True)
-    }
+    grads = {buffer: example.array(x.flatten(0, 1), x.ndim - 2) for buffer, x in zip(surface, cotangents, strict=True)}
     tape.backward(grads=grads)
     for array, (name, leaf) in zip(shape, leaves.items(), strict=True):
         assert_close(wp.to_torch(array.grad), present(leaf.grad), kind="gradient", name=name)
     assert_close(wp.to_torch(view.grad)[0], present(viewmat.grad), kind="gradient", name="viewmat")
-
-
-def launch(tape: wp.Tape, kernel: wp.Kernel, shape: tuple[int, int], inputs: "list[wp.array[Any]]") -> "wp.array[Any]":
-    y = wp.zeros(shape, dtype=REAL, device=inputs[0].device, requires_grad=True)
-    with tape:
-        wp.launch(kernel, shape, inputs=inputs, outputs=[y], device=y.device)
-    return y
-
-
-def warp_program(
-    surfels: dict[str, torch.Tensor],
-    texture: nw.NeuralTexture,
-    viewmat: torch.Tensor,
-    camera: nw.Camera,
-    background: torch.Tensor,
-    weights: torch.Tensor,
-) -> tuple[torch.Tensor, dict[str, torch.Tensor], torch.Tensor]:
-    """Render with nothing but Warp; return the loss, the gradients by name and the image."""
-    t = types(REAL)
-    kinds = {"means": t.vec3, "quats": t.vec4, "scales": t.vec2, "opacities": REAL, "gammas": t.vec2, "sh": t.vec3}
-    x = {key: to_warp(value, kinds[key]) for key, value in surfels.items()}
-    view, position = to_warp(viewmat[None], t.mat44), to_warp(camera.position[None], t.vec3)
-    table = to_warp(texture.grid, wp.types.vector(length=texture.grid.shape[2], dtype=REAL))
-    matrices = [to_warp(w, REAL) for w in texture.mlp.parameters()]
-    image = passes.Image((camera.fx, camera.fy, camera.cx, camera.cy), (camera.width, camera.height), camera.near)
-    focal = to_warp(torch.full((1,), camera.focal, dtype=torch.float64, device=viewmat.device), REAL)
-
-    tape = wp.Tape()
-    colors = passes.plain_colors(tape, x["sh"], x["means"], position, 3)
-    shape = (x["means"], x["quats"], x["scales"], x["opacities"], x["gammas"])
-    records, centers, limits = passes.project(tape, *shape, colors, view)
-    lists = passes.intersect_tiles(*shape, centers, view, image)
-    hits = passes.collect(tape, records, limits, lists, image, HITS)
-    positions, directions = passes.unproject(tape, hits.depths, view, image)
-    resolutions = to_warp(texture.resolutions.double(), REAL)
-    features = passes.hashgrid(tape, table, positions.flatten(), hits.depths.flatten(), resolutions, focal)
-    for index, matrix in enumerate(matrices):
-        if index:
-            features = launch(tape, relu, features.shape, [features])
-        features = launch(tape, matmul, (matrix.shape[0], features.shape[1]), [matrix, features])
-    offset = 0.0 if texture.residual else 0.5
-    texels = passes.textured_colors(tape, features, directions, 3, offset=offset)
-    out, _ = passes.compose(
-        tape,
-        hits.plain,
-        texels.reshape(hits.weights.shape),
-        hits.weights,
-        hits.alphas,
-        to_warp(background[None], t.vec3),
-        hits.base if texture.residual else None,
-    )
-    loss = wp.zeros(1, dtype=REAL, device=out.device, requires_grad=True)
-    with tape:
-        cotangent = to_warp(weights.view(-1, 3), t.vec3)
-        wp.launch(weighted_sum, len(out), inputs=[out, cotangent], outputs=[loss], device=out.device)
-    tape.backward(loss)
-
-    arrays = {**x, "viewmat": view, "position": position, "grid": table}
-    arrays |= {f"mlp{index}": matrix for index, matrix in enumerate(matrices)}
-    gradients = {key: wp.to_torch(value.grad) for key, value in arrays.items()}
-    gradients["viewmat"], gradients["position"] = gradients["viewmat"][0], gradients["position"][0]
-    picture = wp.to_torch(out).view(camera.height, camera.width, 3)
-    return wp.to_torch(loss)[0], gradients, picture
