@@ -159,7 +159,7 @@ class Measured:
     """What a command does when nothing breaks."""
 
     seconds: float
-    bytes: int  # most that it has on the disk at once
+    space: int  # bytes, most that it has on the disk at once
     files: dict[str, bytes]
 
 
@@ -191,7 +191,7 @@ def faults(base: Base, words: list[str], normal: Measured, kind: str, share: flo
     try:
         before = files(base.disk)
         if kind == "full":
-            base.resize((base.used() + int(share * normal.bytes)) // BLOCK * BLOCK + BLOCK)
+            base.resize((base.used() + int(share * normal.space)) // BLOCK * BLOCK + BLOCK)
         child = started(base, words)
         if kind == "kill":
             time.sleep(share * normal.seconds)
