@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
 
 from nexwarp.errors import check_range
+
+Array: TypeAlias = torch.Tensor | np.ndarray
 
 ROTATION_TOLERANCE = 1e-3
 MAX_CAMERAS = 30_000  # of a file
@@ -57,6 +59,20 @@ class Camera:
     fy: float = field(init=False)
     cx: float = field(init=False)
     cy: float = field(init=False)
+
+    if TYPE_CHECKING:  # the constructor takes arrays, the fields are tensors
+
+        def __init__(
+            self,
+            viewmat: Array,
+            K: Array,
+            width: int,
+            height: int,
+            near: float = 0.01,
+            *,
+            origin: tuple[float, float, float] | None = None,
+            checked: tuple[float, float, float, float] | None = None,
+        ) -> None: ...
 
     def __post_init__(self, checked: tuple[float, float, float, float] | None) -> None:
         if checked is None:

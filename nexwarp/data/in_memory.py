@@ -7,12 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.camera import Array, Camera
 from nexwarp.cameras.cameras_file import WORLD
 from nexwarp.data.capture import LARGEST_COORDINATE, LOST_PIXELS, Cloud, far_origin, safe_name
 from nexwarp.data.views import View
-
-Array = torch.Tensor | np.ndarray
 
 
 def split_views(
@@ -61,7 +59,7 @@ def make_cloud(points: Array, colors: Array | None) -> Cloud:
         raise ValueError(f"points[{index}]: expected finite coordinates, got {tuple(positions[index].tolist())}")
     if colors is None:
         raise ValueError(f"colors: expected one for each of {len(positions)} points, got None")
-    values = _bytes("colors", colors)
+    values = as_bytes("colors", colors)
     if values.shape != positions.shape:
         raise ValueError(f"colors: expected shape {tuple(positions.shape)}, got {tuple(values.shape)}")
     return Cloud.of(positions.double().numpy(), values.numpy())
@@ -108,7 +106,7 @@ def _names(names: Sequence[str] | None, count: int) -> list[str]:
 
 
 def _view(index: int, image: Array, camera: Camera, mask: Array | None, name: str) -> View:
-    pixels = _bytes(f"images[{index}]", image)
+    pixels = as_bytes(f"images[{index}]", image)
     if pixels.ndim != 3 or pixels.shape[-1] != 3 or not pixels.numel():
         raise ValueError(f"images[{index}]: expected shape (H, W, 3), got {tuple(pixels.shape)}")
     if not isinstance(camera, Camera):
@@ -136,7 +134,7 @@ def _mask(argument: str, mask: Array, shape: tuple[int, int]) -> torch.Tensor | 
     return None if bool(counts.all()) else counts
 
 
-def _bytes(argument: str, values: Array) -> torch.Tensor:
+def as_bytes(argument: str, values: Array) -> torch.Tensor:
     """Colours in 8 bits: as they are, or rounded from floating values in [0, 1]."""
     tensor = _tensor(argument, values)
     if tensor.dtype == torch.uint8:

@@ -3,30 +3,36 @@
 import dataclasses
 import math
 import os
+import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import numpy as np
 import torch
 from tyro.conf import Positional, arg
 
-from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.camera import Array, Camera
 from nexwarp.data.background import parse_color
-from nexwarp.data.capture import Capture, Cloud, Photo, report_missing, report_unused, scene_errors
+from nexwarp.data.capture import Capture, Cloud, Photo, report_missing, report_unused, safe_name, scene_errors
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.demo import demo_folder
 from nexwarp.data.images import quiet_pillow
-from nexwarp.data.in_memory import Array, make_cloud, near_origin, split_views
+from nexwarp.data.in_memory import as_bytes, make_cloud, near_origin, split_views
 from nexwarp.data.memory import check_memory
 from nexwarp.data.ply import read_ply
 from nexwarp.data.random_points import random_points
 from nexwarp.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, read_blender, read_nerfstudio
 from nexwarp.data.views import PlannedView, View, ViewReader, find_mask
+from nexwarp.errors import MissingError
+from nexwarp.io.pictures import save_png
+
+if TYPE_CHECKING:
+    import pycolmap
 
 DEMO = "demo"
 TEST_EVERY = 8  # the field's split: of the views sorted by name, those with index % 8 == 0 are for testing
@@ -190,6 +196,48 @@ class Scene:
         viewmats = [view.camera.viewmat.double().numpy() for view in train]
         scale = _scene_scale("cameras", viewmats, cloud)
         return _make_scene(train, test, cloud, scale, Path("memory"), None)
+
+    @classmethod
+    def from_pycolmap(
+        cls,
+        reconstruction: "pycolmap.Reconstruction",
+        images: str | os.PathLike[str] | Mapping[str, Array],
+        downscale: int = 1,
+        **options: Any,
+    ) -> "Scene":
+        """Make a scene of a reconstruction of pycolmap, which goes through a temporary folder.
+
+        Args:
+            reconstruction: cameras, registered images and points. Points tell which photos see them, as in files.
+            images: folder of the photos; or name of an image -> its photo (H, W, 3), uint8 or floating in [0, 1].
+            downscale: as of `load_scene`.
+            options: as of `load_scene`; `masks` is the path of a folder, None by default.
+
+        Returns:
+            The scene; its `path` is `Path("memory")`.
+
+        Raises:
+            TypeError: `reconstruction` is none. Otherwise as of `load_scene`.
+        """
+        if not hasattr(reconstruction, "write_binary"):
+            kind = type(reconstruction).__name__
+            raise TypeError(f"reconstruction: expected a pycolmap.Reconstruction, got {kind}")
+        if not isinstance(images, Mapping) and not Path(images).is_dir():
+            raise MissingError(f"images: expected the folder of the photos, found none at {images}")
+        with tempfile.TemporaryDirectory() as folder:
+            model = Path(folder) / "sparse" / "0"
+            model.mkdir(parents=True)
+            reconstruction.write_binary(str(model))
+            if isinstance(images, Mapping):
+                photos = Path(folder) / "images"
+                for name, image in images.items():
+                    file = photos / safe_name("images:", name, "images folder")
+                    file.parent.mkdir(parents=True, exist_ok=True)
+                    save_png(file, as_bytes(f"images[{name!r}]", image))
+            else:
+                photos = Path(images).resolve()
+            scene = load_scene(folder, str(photos), downscale, **{"masks": None, **options})
+        return dataclasses.replace(scene, path=Path("memory"))
 
 
 def load_scene(

@@ -4,9 +4,11 @@ import dataclasses
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
+from torch.utils.data._utils.collate import collate, default_collate_fn_map
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.data.capture import Photo, find_file
@@ -52,6 +54,24 @@ class View:
     name: str
     alpha: torch.Tensor | None = None
     points: torch.Tensor | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a batch of a torch `DataLoader` is made of, which is how views collate.
+
+        `image` (H, W, 3) uint8, `mask` (H, W) bool, all True where all pixels count, `viewmat` (4, 4) and `K` (3, 3)
+        float32, `near`, `width`, `height` and `name`.
+        """
+        camera = self.camera
+        mask = torch.ones(self.image.shape[:2], dtype=torch.bool) if self.mask is None else self.mask
+        numbers = {"near": camera.near, "width": camera.width, "height": camera.height, "name": self.name}
+        return {"image": self.image, "mask": mask, "viewmat": camera.viewmat, "K": camera.K, **numbers}
+
+
+def _collate(views: list[View], *, collate_fn_map: Any = None) -> Any:
+    return collate([view.as_dict() for view in views], collate_fn_map=collate_fn_map)
+
+
+default_collate_fn_map[View] = _collate
 
 
 @dataclass(frozen=True)

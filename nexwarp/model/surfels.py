@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from nexwarp import ops
+from nexwarp.cameras.camera import Array
 from nexwarp.data.ply import read_vertices
 from nexwarp.errors import FormatError, check_finite, check_tensors
 from nexwarp.kernels.types import MAX_SH_DEGREE
@@ -72,14 +73,16 @@ class Surfels(nn.Module):
     @classmethod
     def from_activated(
         cls,
-        means: torch.Tensor,
-        quats: torch.Tensor,
-        scales: torch.Tensor,
-        opacities: torch.Tensor,
-        gammas: torch.Tensor,
-        sh: torch.Tensor,
+        means: Array,
+        quats: Array,
+        scales: Array,
+        opacities: Array,
+        gammas: Array,
+        sh: Array,
     ) -> "Surfels":
         """Make surfels with new leaf parameters from activated values; `rasterize` keeps the graph of tensors.
+
+        NumPy arrays become tensors on the CPU.
 
         Args:
             means: (N, 3) centres, world units.
@@ -93,6 +96,10 @@ class Surfels(nn.Module):
             TypeError, ValueError: a type, shape, device or value does not fit, or a tensor has a graph, which the new
                 parameters would cut; the message names the argument.
         """
+        means, quats, scales, opacities, gammas, sh = (
+            torch.from_numpy(x) if isinstance(x, np.ndarray) else x
+            for x in (means, quats, scales, opacities, gammas, sh)
+        )
         arguments = {
             "means": (means, ("N", 3)),
             "quats": (quats, ("N", 4)),

@@ -142,3 +142,14 @@ def test_frames_and_a_video_along_a_path_are_written(model: Path, tmp_path: Path
 def test_a_pixel_is_drawn_without_nexwarp(model: Path) -> None:
     out = run("read_model", "--run", model, "--column", 20, "--row", 10)
     assert re.fullmatch(r"view_000\.png, column 20, row 10: \[ *\d+ +\d+ +\d+\]\n", out), out
+
+
+def test_a_scene_is_shown_with_viser() -> None:
+    pytest.importorskip("viser")
+    assert "Server stopped" in run("viser_scene", "--port", 0, "--seconds", 0.5)
+
+
+def test_a_scene_is_logged_to_rerun(tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    run("rerun_scene", "--out", tmp_path / "scene.rrd")
+    assert (tmp_path / "scene.rrd").stat().st_size > 10_000

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from nexwarp.data import load_scene
+from nexwarp.data import Scene, load_scene
+from nexwarp.data.lens import pycolmap_module
 from tests.data.test_scene import make_scene, views_of
 
 KEYPOINTS = re.compile(rb"(?m)^(?:[-+.0-9e]+ [-+.0-9e]+ -?[0-9]+ ?)*\n")
@@ -136,3 +137,29 @@ def test_points_of_images_that_were_deleted_keep_the_rest(tmp_path):
     with pytest.warns(UserWarning, match="20 observations of points are of 1 images .* such as id 2; left out"):
         scene = load_scene(path)
     assert np.array_equal(scene.track_lengths, reference.track_lengths - 1) and len(views_of(scene)) == 9
+
+
+@pytest.mark.parametrize("arrays", [False, True])
+def test_a_reconstruction_in_memory_is_the_scene_of_its_files(tmp_path, arrays):
+    path = make_scene(tmp_path)
+    reference = load_scene(path)
+    photos = {view.name: view.image.numpy() for view in views_of(reference)}
+    reconstruction = pycolmap_module().Reconstruction(str(path / "sparse/0"))
+    scene = Scene.from_pycolmap(reconstruction, photos if arrays else path / "images")
+    for one, other in zip(views_of(scene), views_of(reference), strict=True):
+        assert one.image.equal(other.image) and one.camera.viewmat.equal(other.camera.viewmat)
+        assert one.points.equal(other.points) and one.camera.K.equal(other.camera.K)
+    assert scene.points.equal(reference.points) and scene.path == Path("memory")
+    with pytest.raises(FileNotFoundError, match="images: expected the folder of the photos, found none at"):
+        Scene.from_pycolmap(reconstruction, tmp_path / "absent")
+    with pytest.raises(TypeError, match=r"reconstruction: expected a pycolmap.Reconstruction, got str"):
+        Scene.from_pycolmap("sparse/0", path / "images")
+
+
+def test_views_are_what_a_data_loader_collates(tmp_path):
+    scene = load_scene(make_scene(tmp_path))
+    batch = next(iter(torch.utils.data.DataLoader(scene.train, batch_size=3)))
+    assert batch["name"] == [view.name for view in scene.train[:3]] and batch["mask"].all()
+    for index, view in enumerate(scene.train[:3]):
+        assert batch["image"][index].equal(view.image) and batch["viewmat"][index].equal(view.camera.viewmat)
+        assert batch["K"][index].equal(view.camera.K) and batch["width"][index] == view.camera.width
