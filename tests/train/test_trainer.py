@@ -152,6 +152,7 @@ def test_rates_are_log_linear_between_their_ends(scene):
     config = small(iterations=9, rates=LearningRates(mlp=(1e-3, 1e-5)))
     trainer, rates = Trainer(scene, config, "cpu"), []
     trainer.run(lambda _: rates.append([group["lr"] for group in trainer.optimizer.param_groups]))
+    assert trainer.optimizer.defaults["eps"] == 1e-15  # the paper's
     r, s = config.rates, scene.scale
     constant = [r.quats, r.scales, r.opacities, r.gammas, r.sh0, r.shN]
     assert rates[0] == pytest.approx([1.6e-4 * s, *constant, 1e-3, 1e-3], rel=1e-12)
