@@ -46,7 +46,7 @@ def trained_like(scene: SurfelScene) -> tuple[nw.NeuralTexture, nw.DetailLimits]
 
     The finest level's cells are as large as the pixels of nearly all views at the surfels in front of them.
     """
-    if scene.model.texture is not None and scene.model.detail_limits is not None:
+    if isinstance(scene.model.texture, nw.NeuralTexture) and scene.model.detail_limits is not None:
         return scene.model.texture, scene.model.detail_limits
     sizes = []
     for camera in scene.cameras:

@@ -147,7 +147,7 @@ class NeuralTexture(Texture):
     summed in float32. Set `half_precision` to False to compute in float32. `torch.autocast` changes neither.
     """
 
-    config: TextureShape  # type: ignore[assignment]  # a mapping, too
+    config: TextureShape
     resolutions: torch.Tensor
     # The grid in half precision, and which grid it was: address and version.
     _half_copy: tuple[torch.Tensor, tuple[int, int]] | None = None

@@ -35,9 +35,10 @@ class DensityControl:
 
     def __init__(self, surfels: Surfels, config: Config) -> None:
         """Watch surfels, by the settings `densify`, `iterations` and `max_surfels` of a config."""
-        stretched = {name: config.scaled(getattr(config.densify, name)) for name in ("start", "stop", "every")}
-        stretched["every"] = max(stretched["every"], min(config.densify.every, SHORTEST_ROUND))
-        self.config = dataclasses.replace(config.densify, **stretched)
+        schedule = config.densify
+        every = max(config.scaled(schedule.every), min(schedule.every, SHORTEST_ROUND))
+        start, stop = config.scaled(schedule.start), config.scaled(schedule.stop)
+        self.config = dataclasses.replace(schedule, start=start, stop=stop, every=every)
         self.max_surfels = config.max_surfels
         self.surfels = surfels
         self.errors = torch.zeros_like(surfels.logit_opacities.detach())

@@ -39,14 +39,14 @@ def test_jitter_moves_lookups_along_their_rays(
 ) -> None:
     """By a normal share of a pixel's size there, and nothing but what the texture says changes."""
     scene = random_scene(width=120, height=90, device=device)
-    texture, colors = make_texture(device=device), nw.NeuralTexture.colors
+    texture, colors = make_texture(device=device), nw.NeuralTexture.evaluate
     lookups: list[torch.Tensor] = []
 
     def spy(texture: nw.NeuralTexture, positions: torch.Tensor, *arguments: Any, **options: Any) -> torch.Tensor:
         lookups.append(positions.detach())
         return colors(texture, positions, *arguments, **options)
 
-    monkeypatch.setattr(nw.NeuralTexture, "colors", spy)
+    monkeypatch.setattr(nw.NeuralTexture, "evaluate", spy)
     still, camera = draw(scene, texture), make_camera(scene)
     generator = torch.Generator(device).manual_seed(3)
     factors = jitter_factors(camera, 2, jitter, scene["means"].dtype, generator)

@@ -77,15 +77,18 @@ def test_bad_files_are_refused(tmp_path: Path, changes: dict[str, torch.Tensor |
 def test_a_training_starts_from_what_is_given(tiny_scene: Scene) -> None:
     config = small()
     first = trained(tiny_scene, config).finish()
+    assert isinstance(first.texture, nw.NeuralTexture)
     from_model = nw.Trainer(tiny_scene, config, "cpu", init=first)
     assert all(torch.equal(getattr(from_model.surfels, name), getattr(first.surfels, name)) for name in PARAMETERS)
-    assert first.texture is not None and torch.equal(from_model.texture.grid, first.texture.grid)
+    assert isinstance(from_model.texture, nw.NeuralTexture)
+    assert torch.equal(from_model.texture.grid, first.texture.grid)
     assert from_model.texture is not first.texture
     plain = dataclasses.replace(config, sh_degree=1)
     from_surfels = nw.Trainer(tiny_scene, plain, "cpu", surfels=first.surfels)
     assert torch.equal(from_surfels.surfels.sh, first.surfels.sh[:, :4])
     back = nw.Trainer(tiny_scene, config, "cpu", surfels=from_surfels.surfels).surfels
     assert torch.equal(back.sh[:, :4], first.surfels.sh[:, :4]) and not back.sh[:, 4:].any()
+    assert isinstance(from_surfels.texture, nw.NeuralTexture)
     assert not torch.equal(from_surfels.texture.grid, first.texture.grid)
     other = nw.Model(first.surfels, None, meta={"scene_scale": 2 * tiny_scene.scale})
     for start, message in (
@@ -96,7 +99,7 @@ def test_a_training_starts_from_what_is_given(tiny_scene: Scene) -> None:
         ({"begin": 3}, "begin: expected no argument of this name"),
     ):
         with pytest.raises((TypeError, ValueError), match=message):
-            nw.train(tiny_scene, config, device="cpu", **start)  # type: ignore[arg-type]
+            nw.train(tiny_scene, config, device="cpu", **start)
 
 
 def test_the_command_starts_from_a_file_or_a_run(tiny_folder: Path, tmp_path: Path, capsys) -> None:
