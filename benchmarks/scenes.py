@@ -136,7 +136,7 @@ def texture(scene: SurfelScene, **shape: Any) -> nw.NeuralTexture:
         scene: a random texture has a table of 2^20 on scenes of 40,000 surfels or more, else of 2^15.
         shape: arguments of `NeuralTexture` for a random texture.
     """
-    if scene.model.texture is not None:
+    if isinstance(scene.model.texture, nw.NeuralTexture):
         return scene.model.texture
     large = len(scene.surfels) >= SAHAROV
     defaults = {"table_size": 2**20 if large else 2**15, "min_resolution": 16.0, "max_resolution": 1024.0}

@@ -5,6 +5,8 @@ from typing import TypeVar
 
 import torch
 
+import nexwarp as nw
+
 T = TypeVar("T")
 
 
@@ -12,6 +14,12 @@ def present(value: T | None) -> T:
     """Return `value`, which must not be None."""
     assert value is not None
     return value
+
+
+def neural(texture: object) -> nw.NeuralTexture:
+    """Return a texture, which must be ours."""
+    assert isinstance(texture, nw.NeuralTexture)
+    return texture
 
 
 def total(terms: Iterable[torch.Tensor | None]) -> torch.Tensor:

@@ -384,7 +384,7 @@ def _texels(
         positions, directions = ops.unproject(shifted, camera.viewmat, pinhole_of(camera, shifted))
     found = Hits(hits.ids, hits.depths, hits.weights, hits.plain, hits.alpha, positions, directions)
     if not isinstance(texture, NeuralTexture):
-        colors = texture.colors(found, camera)
+        colors = texture.colors(found, camera)  # type: ignore[arg-type]  # panoramas and the like, too
         expected = {"texture.colors": (colors, tuple(positions.shape))}
         check_tensors(expected, dtype=positions.dtype, device=positions.device)
         return (colors.clamp_min(0) if options.clamp_texture else colors).contiguous()

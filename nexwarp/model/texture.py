@@ -70,7 +70,7 @@ class Texture(nn.Module):
     per_surfel: tuple[str, ...] = ()
     config: Mapping[str, object]
 
-    def colors(self, hits: Hits, camera: Camera | RayCamera) -> torch.Tensor:
+    def colors(self, hits: Hits, camera: Camera) -> torch.Tensor:
         """Return the colours (H, W, K, 3) of hits; those in empty slots do not count, as long as they are finite."""
         raise NotImplementedError(f"{type(self).__name__}.colors: expected a method that returns colours of hits")
 

@@ -110,7 +110,7 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
     camera = load_cameras(run / "cameras.json")["test"][name]
     model = nw.load(run)
     texture = model.texture
-    assert texture is not None
+    assert isinstance(texture, nw.NeuralTexture)
     others = list(load_cameras(run / "cameras.json")["train"].values())[:3]
     with torch.no_grad():  # more to be seen than after so few steps
         texture.grid.normal_(0, 2)

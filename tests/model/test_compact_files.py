@@ -139,7 +139,7 @@ def test_the_documented_reader_decodes_a_compact_file(tmp_path: Path) -> None:
     loaded = nw.load(file)
     for name, value in loaded.surfels.state_dict().items():
         np.testing.assert_allclose(tensors[f"surfels.{name}"], value.numpy(), rtol=1e-6, atol=1e-9, err_msg=name)
-    assert loaded.texture is not None and loaded.detail_limits is not None
+    assert isinstance(loaded.texture, nw.NeuralTexture) and loaded.detail_limits is not None
     np.testing.assert_allclose(tensors["texture.grid"], loaded.texture.grid.detach().numpy(), rtol=1e-6, atol=1e-9)
     np.testing.assert_array_equal(tensors["footprints"], loaded.detail_limits.nearest.numpy())
 

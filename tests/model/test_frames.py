@@ -19,7 +19,7 @@ from nexwarp.model import graphs as frames
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.graphs import Frame
 from nexwarp.model.render import Rendering, draw
-from tests.narrowing import present
+from tests.narrowing import neural, present
 from tests.render_support import BUFFERS, assert_same
 from tests.scenes import make_surfels, make_texture, random_scene
 
@@ -328,12 +328,12 @@ def test_changes_of_the_model_show(model: nw.Model) -> None:
     camera, exposures = cameras("cuda")[1], present(model.exposures)
     changes: list[Callable[[], object]] = [
         lambda: model.surfels.means.data.add_(0.05),
-        lambda: present(model.texture).grid.data.mul_(1.5),
+        lambda: neural(model.texture).grid.data.mul_(1.5),
         lambda: [x.add_(0.1) for x in (exposures.log_gains, exposures.mean)],
         lambda: present(model.detail_limits).farthest.mul_(0.5),
         lambda: setattr(model.surfels, "means", torch.nn.Parameter(model.surfels.means + 0.1)),
-        lambda: present(model.texture).half_copy(),
-        lambda: present(model.texture).grid.mul_(1.1),
+        lambda: neural(model.texture).half_copy(),
+        lambda: neural(model.texture).grid.mul_(1.1),
         lambda: setattr(model.texture, "half_precision", False),
         lambda: exposures.load_state_dict(exposures.state_dict() | {"falloff": torch.tensor([-0.5, 0.0, 0.4])}),
         lambda: model.load_state_dict(finished("cuda", seed=5).state_dict()),

@@ -235,7 +235,7 @@ def test_gradients_are_those_of_the_pure_rendering(device: torch.device) -> None
     camera, found = make_camera(random_scene(1, device=device)), []
     for through_model in (True, False):
         model = full_model(device)
-        assert model.texture is not None
+        assert isinstance(model.texture, nw.NeuralTexture)
         model.texture.half_precision = False
         behind = torch.tensor(OPTIONS.background, device=device, requires_grad=True)
         if through_model:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -41,7 +42,7 @@ class Painted(nw.Texture):
         self.mlp.register_buffer("numbers", torch.arange(count).float())
 
     @property
-    def config(self) -> dict[str, int]:
+    def config(self) -> dict[str, int]:  # type: ignore[override]
         return {"count": len(self.grid)}
 
     def colors(self, hits: nw.Hits, camera: nw.Camera) -> torch.Tensor:
@@ -77,7 +78,7 @@ def test_a_file_keeps_what_is_registered_and_refuses_the_rest(tmp_path: Path) ->
         model = nw.load(nw.Model(surfels, texture).save(tmp_path / "model.safetensors", compact=compact))
         expected = nw.render(model.surfels, texture, camera).image
         assert torch.equal(model.render(camera, background=(0, 0, 0), sh_degree=3).image, expected)
-    texture.mlp.numbers = torch.arange(30)  # type: ignore[assignment]
+    texture.mlp.numbers = torch.arange(30)
     wrong = type("Painted", (Painted,), {})
     for kind, message in (
         (texture, "texture.config: expected arguments that give tensors"),
@@ -108,7 +109,7 @@ def test_training_moves_parameters_and_rows(tiny_scene: Scene, config: nw.Config
     texture = model.texture
     assert isinstance(texture, Painted)
     assert len(texture.grid) == len(model.surfels) == 200 > reports[0].surfels and texture.grid.any()
-    numbers = texture.mlp.numbers.long()
+    numbers = texture.get_buffer("mlp.numbers").long()
     assert len(numbers) == 200 and len(numbers.unique()) < 200 and numbers.max() < reports[0].surfels
     assert reports[0].losses["regulariser"] == 0 < reports[-1].losses["regulariser"]
     again = nw.load(model.save(tmp_path))
@@ -137,12 +138,13 @@ def test_what_does_not_fit_is_refused(tiny_scene: Scene, config: nw.Config) -> N
     for name in ("texture", "surfels"):
         with pytest.raises(AttributeError):
             setattr(trainer, name, getattr(trainer, name))
-    for texture, changes, message in (
+    wrong: list[tuple[Any, dict[str, Any], str]] = [
         (3, {}, "texture: expected a nexwarp.Texture"),
         (lambda *_: 3, {}, "texture: expected a function that returns a nexwarp.Texture, got int"),
         (Painted(3), {}, r"texture\.grid: expected a row for each of \d+ surfels, got 3"),
         (Wrapped().double(), {}, r"texture\.inner\.grid: expected float32"),
         (Wrapped(), {"max_hits": 0}, "texture: expected None with max_hits = 0"),
-    ):
+    ]
+    for texture, changes, message in wrong:
         with pytest.raises((TypeError, ValueError), match=message):
             nw.train(tiny_scene, dataclasses.replace(config, **changes), device="cpu", texture=texture)

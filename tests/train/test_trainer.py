@@ -16,6 +16,7 @@ from nexwarp.data import Scene, View
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.recipe import Config, DensifyConfig, LearningRates, TextureConfig
 from nexwarp.train.trainer import Trainer
+from tests.narrowing import neural
 from tests.scene_writers import with_exposures
 from tests.tolerances import assert_close
 from tests.trainer_support import OFTEN, TEXTURE, assert_same_state, rescaled, small, trained
@@ -74,7 +75,7 @@ def test_same_seed_same_run_and_other_seeds_differ(scene):
     assert_same_state(first, trained(scene, small(seed=1)))
     other = trained(scene, small(seed=2))
     assert not torch.equal(first.surfels.raw_quats[:60], other.surfels.raw_quats[:60])
-    assert not torch.equal(next(first.texture.mlp.parameters()), next(other.texture.mlp.parameters()))
+    assert not torch.equal(next(neural(first.texture).mlp.parameters()), next(neural(other.texture).mlp.parameters()))
     assert first.order != other.order
 
 
@@ -199,7 +200,7 @@ def test_surfels_settle_with_two_hits(scene):
             assert_same_state(four, two)
         now = [t.render_options().max_hits for t in (two, four, early)]
         assert now == [2, 2 if iteration < 10 else 4, 4]
-    assert not torch.equal(four.texture.grid, two.texture.grid)
+    assert not torch.equal(neural(four.texture).grid, neural(two.texture).grid)
     assert four.finish().options.max_hits == 4
     for hits in (0, 1):
         few = Trainer(scene, small(iterations=12, max_hits=hits), "cpu")

@@ -30,7 +30,7 @@ def test_a_full_file_holds_every_bit():
     for name in ("means", "quats", "scales", "opacities", "gammas", "limits", "sh"):
         np.testing.assert_array_equal(arrays[name], getattr(expected, name))
     assert header["options"]["background"] == list(model.options.background)
-    assert model.texture is not None and expected.exposures is not None
+    assert isinstance(model.texture, nw.NeuralTexture) and expected.exposures is not None
     np.testing.assert_array_equal(arrays["grid"], model.texture.grid.detach().numpy())
     np.testing.assert_array_equal(np.float32(header["texture"]["resolutions"]), model.texture.resolutions.numpy())
     weights = [matrix.detach().numpy().ravel() for matrix in model.texture.mlp.parameters()]
