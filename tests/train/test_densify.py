@@ -332,7 +332,8 @@ def test_chosen_ones_are_removed_but_never_the_most_opaque():
 @pytest.mark.parametrize("budget", [24, 80])
 def test_a_loop_of_ones_own_takes_along_what_belongs_to_surfels(kind, budget):
     """Parameters of a module, a buffer and plain tensors follow the row map; an optimizer's state, too."""
-    surfels, extra = make_surfels(random_scene(20)), nn.Module()
+    surfels = make_surfels(random_scene(20))
+    extra: Any = nn.Module()
     extra.register_parameter("features", nn.Parameter(torch.rand(20, 5)))
     extra.register_buffer("numbers", torch.arange(20))
     optimizer = kind([{"params": surfels.parameters()}, {"params": extra.parameters()}], lr=1e-3)
