@@ -9,6 +9,7 @@ from tests.render_support import (
     BUFFERS,
     MAX_HITS,
     assert_alike,
+    assert_gradients,
     assert_same,
     draw,
     loss,
@@ -177,6 +178,29 @@ def test_awkward_surfels_agree_with_the_reference(device: torch.device) -> None:
     expected = reference_render(twin(surfels), None, camera.to("cpu"), max_hits=4)
     assert_same_ids(out.ids, expected.ids, name="ids")
     assert_alike(out, expected)
+
+
+@pytest.mark.parametrize("textured", [False, True])
+def test_surfels_nearer_than_the_near_plane_count_neither_forward_nor_backward(
+    textured: bool, device: torch.device
+) -> None:
+    """The plane goes through the scene: surfels lie wholly before it, across it and behind it."""
+    scene = random_scene(40, width=36, height=28, dtype=torch.float64, device=device)
+    texture = make_texture(dtype=torch.float64, device=device) if textured else None
+    surfels, camera = make_surfels(scene), make_camera(scene, near=3.0)
+    expected_surfels, expected_texture = twin(surfels), twin(texture)
+    out = nw.render(surfels, texture, camera, max_hits=2)
+    expected_camera = make_camera(scene, near=3.0).to("cpu")
+    expected = reference_render(expected_surfels, expected_texture, expected_camera, max_hits=2)
+    loss(out).backward()
+    loss(expected).backward()
+    everything = nw.render(surfels, texture, make_camera(scene), max_hits=2)
+    assert (out.ids != everything.ids).double().mean() > 0.2
+    assert_same_ids(out.ids, expected.ids, name="ids")
+    assert_alike(out, expected)
+    assert_gradients(surfels, expected_surfels, torch.float64)
+    if texture is not None:
+        assert_gradients(texture, expected_texture, torch.float64)
 
 
 @pytest.mark.parametrize("max_hits", [0, 1, 2, 3, 5, 8])
