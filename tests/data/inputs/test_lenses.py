@@ -1,5 +1,7 @@
 """Photos of other lenses are undistorted."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -71,7 +73,7 @@ def rays_through(bend, focal: float = FOCAL) -> np.ndarray:
 BARREL_K = {"k1": -0.18, "k2": 0.08}
 BROWN = {**BARREL_K, "k3": 0.02, "k4": 0.15, "p1": 0.01}
 TURNED = (0.01, -0.006)
-LENSES = {
+LENSES: dict[str, Any] = {
     "OPENCV": (
         {**BARREL_K, "p1": 0.01, "p2": -0.006},
         radial((), (-0.18, 0.08), (), TURNED),

@@ -153,12 +153,12 @@ def test_a_reconstruction_in_memory_is_the_scene_of_its_files(tmp_path, arrays):
     with pytest.raises(FileNotFoundError, match="images: expected the folder of the photos, found none at"):
         Scene.from_pycolmap(reconstruction, tmp_path / "absent")
     with pytest.raises(TypeError, match=r"reconstruction: expected a pycolmap.Reconstruction, got str"):
-        Scene.from_pycolmap("sparse/0", path / "images")
+        Scene.from_pycolmap("sparse/0", path / "images")  # type: ignore[arg-type]
 
 
 def test_views_are_what_a_data_loader_collates(tmp_path):
     scene = load_scene(make_scene(tmp_path))
-    batch = next(iter(torch.utils.data.DataLoader(scene.train, batch_size=3)))
+    batch = next(iter(torch.utils.data.DataLoader(scene.train, batch_size=3)))  # type: ignore[arg-type, var-annotated]
     assert batch["name"] == [view.name for view in scene.train[:3]] and batch["mask"].all()
     for index, view in enumerate(scene.train[:3]):
         assert batch["image"][index].equal(view.image) and batch["viewmat"][index].equal(view.camera.viewmat)

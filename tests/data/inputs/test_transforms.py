@@ -4,6 +4,7 @@ import json
 import math
 import unicodedata
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,7 +23,7 @@ def write(path: Path, pinhole=room.PINHOLE, names=None, encoding="utf-8", frame=
     """Write photos of a pinhole camera, and a file with keys for all frames and for each frame."""
     rays = room.pinhole_rays(pinhole)
     names = [f"images/{index}.png" for index in range(room.VIEWS)] if names is None else names
-    data = room.transforms(names, **keys)
+    data: dict[str, Any] = room.transforms(names, **keys)
     for entry, photo in zip(data["frames"], room.photos(rays=rays), strict=True):
         file = path / unicodedata.normalize("NFC", entry["file_path"]).replace("\\", "/")
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -32,7 +33,7 @@ def write(path: Path, pinhole=room.PINHOLE, names=None, encoding="utf-8", frame=
     return path
 
 
-INTRINSICS = {
+INTRINSICS: dict[str, Any] = {
     # pinhole of the photos, keys of each frame, keys of the file
     "the frame's angle, the file's focal length": (SQUARE, {"camera_angle_x": ANGLE_X}, {"cx": 32, "cy": 24}),
     "the frame's fl_x, the file's fl_y": (SQUARE, {"fl_x": 40.0}, {"fl_y": 99.0, "cx": 32, "cy": 24}),
@@ -68,7 +69,7 @@ def absolute(path: Path) -> Path:
 def bare(path: Path) -> Path:
     """As ScanNet++ names photos, and holds some out."""
     names = [f"{index}.png" for index in range(room.VIEWS)]
-    data = room.transforms(names)
+    data: dict[str, Any] = room.transforms(names)
     room.write_photos(path / "images")
     data["test_frames"] = data["frames"][:2]
     return room.write_transforms(path, {**data, "frames": data["frames"][2:]})
