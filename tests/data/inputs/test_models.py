@@ -158,7 +158,7 @@ def test_a_reconstruction_in_memory_is_the_scene_of_its_files(tmp_path, arrays):
 
 def test_views_are_what_a_data_loader_collates(tmp_path):
     scene = load_scene(make_scene(tmp_path))
-    batch = next(iter(torch.utils.data.DataLoader(scene.train, batch_size=3)))  # type: ignore[arg-type, var-annotated]
+    batch = next(iter(torch.utils.data.DataLoader(scene.train, batch_size=3)))  # type: ignore[arg-type]
     assert batch["name"] == [view.name for view in scene.train[:3]] and batch["mask"].all()
     for index, view in enumerate(scene.train[:3]):
         assert batch["image"][index].equal(view.image) and batch["viewmat"][index].equal(view.camera.viewmat)
