@@ -1,9 +1,11 @@
 """From videos and photos to scenes: which frames are taken, what is named, what is refused."""
 
 import json
+import weakref
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +18,7 @@ from nexwarp.data import load_scene
 from nexwarp.data.sfm.frames import motion, sharpness, take_frames
 from nexwarp.data.sfm.photos import judged, read_photos
 from nexwarp.data.sfm.process import process
-from nexwarp.io.video import frame_pixels, read_frames, video_writer
+from nexwarp.io.video import frame_luma, frame_pixels, read_frames, video_writer
 from tests.cli.support import refused
 
 pytest.importorskip("av", reason="PyAV is not installed (pip install 'nexwarp[video]')")
@@ -74,6 +76,22 @@ def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
     assert (choice.frames, choice.blurred, choice.duplicates) == (25, [], [])
     assert sorted(f.name for f in folder.iterdir()) == [f"frame_{i:06d}.jpg" for i in sorted(sharp)]
     assert len(take_frames(path, 1000, tmp_path, silent).chosen) <= 25
+
+
+def test_no_pictures_of_frames_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alive: weakref.WeakValueDictionary[int, np.ndarray] = weakref.WeakValueDictionary()
+    most = 0
+
+    def counted(frame: Any, longest: int) -> np.ndarray:
+        nonlocal most
+        picture = frame_luma(frame, longest)
+        alive[len(alive) and max(alive) + 1] = picture
+        most = max(most, len(alive))
+        return picture
+
+    monkeypatch.setattr("nexwarp.data.sfm.frames.frame_luma", counted)
+    take_frames(clip(tmp_path / "a.mp4", 30), 30, tmp_path, silent)
+    assert most <= 3
 
 
 def test_blurred_and_repeated_frames_are_left_out_and_named(tmp_path: Path) -> None:
