@@ -13,7 +13,6 @@ from warp.optim import Adam
 
 import nexwarp as nw
 from nexwarp import tape as stages
-from nexwarp.data import demo_folder
 
 Array: TypeAlias = "wp.array[Any]"
 VECTORS = ("means", "raw_quats", "log_scales", "raw_gammas", "sh0", "shN", "grid")
@@ -102,7 +101,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=100)
     args = parser.parse_args()
-    scene = nw.load_scene(demo_folder(), downscale=4)
+    scene = nw.load_scene("demo", downscale=4)
     torch.manual_seed(0)
     surfels, texture = start(scene)
     losses = train(parameters_of(surfels, texture), array(texture.resolutions), scene.train, args.steps)
