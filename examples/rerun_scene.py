@@ -9,7 +9,6 @@ import rerun as rr
 import torch
 
 import nexwarp as nw
-from nexwarp.data.scene import SceneSource
 
 
 def log_camera(path: str, camera: nw.Camera) -> None:
@@ -27,7 +26,7 @@ def main() -> None:
     parser.add_argument("--model", help="a run or a model, whose renderings of the test views are logged")
     parser.add_argument("--out", help="a .rrd file")
     args = parser.parse_args()
-    scene = SceneSource(args.scene).load()
+    scene = nw.load_scene(args.scene)
     rr.init("nexwarp", spawn=args.out is None)
     if args.out is not None:
         rr.save(args.out)

@@ -11,7 +11,6 @@ import viser
 import viser.transforms as tf
 
 import nexwarp as nw
-from nexwarp.data.scene import SceneSource
 
 
 def show(server: viser.ViserServer, scene: nw.Scene) -> None:
@@ -38,7 +37,7 @@ def main() -> None:
     parser.add_argument("--port", type=int, default=8080)
     parser.add_argument("--seconds", type=float, default=float("inf"))
     args = parser.parse_args()
-    scene = SceneSource(args.scene).load()
+    scene = nw.load_scene(args.scene)
     server = viser.ViserServer(host="127.0.0.1", port=args.port)
     show(server, scene)
     model = nw.load(args.model).to("cuda" if torch.cuda.is_available() else "cpu") if args.model else None
