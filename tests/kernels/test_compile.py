@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[2]
     ("arch", "choice", "least"),
     [
         (80, "atomic", 6),
-        (90, "usual", 80),
+        (90, "usual", 70),
         *(pytest.param(arch, "all", 120, marks=pytest.mark.slow) for arch in (80, 90)),
     ],
 )

@@ -1,7 +1,6 @@
 """A Warp-only program differentiates a whole render with `tape.backward()`, and agrees with torch's gradients."""
 
 import dataclasses
-from typing import Any
 
 import torch
 import warp as wp
@@ -107,11 +106,12 @@ def test_tape_and_torch_give_the_same_gradients_of_a_surface(device: torch.devic
     torch.autograd.backward(buffers, cotangents)
 
     tape = wp.Tape()
-    shape: Any = [example.array(x, x.ndim - 1) for x in given]
+    shape = [example.array(x, x.ndim - 1) for x in given]
+    m, q, s, o, g = shape
     view, colors = example.array(viewmat[None], 2), example.array(torch.zeros_like(scene["means"]), 1)
     image = passes.Image((camera.fx, camera.fy, camera.cx, camera.cy), (camera.width, camera.height), camera.near)
-    records, centers, limits = passes.project(tape, *shape, colors=colors, viewmat=view)
-    lists = passes.intersect_tiles(*shape, centers=centers, viewmat=view, image=image)
+    records, centers, limits = passes.project(tape, m, q, s, o, g, colors, view)
+    lists = passes.intersect_tiles(m, q, s, o, g, centers, view, image)
     stops = passes.collect(tape, records, limits, lists, image, HITS).stops
     surface = passes.surface(tape, records, limits, lists, image, stops)
     for buffer, expected in zip(surface, buffers, strict=True):

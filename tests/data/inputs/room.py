@@ -6,6 +6,7 @@ The room is a box, so that every point of its walls is visible wherever it proje
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -109,7 +110,7 @@ def write_colmap(
     return path
 
 
-def transforms(names: Sequence[str], applied: np.ndarray | None = None, **keys: object) -> dict[str, object]:
+def transforms(names: Sequence[str], applied: np.ndarray | None = None, **keys: Any) -> dict[str, Any]:
     """Return a transforms.json of the photos `names`, its world moved by `applied` (3, 4); `keys` add or replace."""
     moved = np.eye(4) if applied is None else np.vstack([applied, [0, 0, 0, 1]])
     frames = [
@@ -138,7 +139,7 @@ def project(view, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return pixels[inside], np.flatnonzero(inside)
 
 
-def color_error(scene, origin: Sequence[float] = (0.0, 0.0, 0.0), paint: Callable = paint) -> float:
+def color_error(scene, origin: Sequence[float] = (0.0, 0.0, 0.0), paint: Callable[..., np.ndarray] = paint) -> float:
     """Largest mean difference of a view, of 255, between its photo and the room's colours at points of its walls.
 
     `origin` is the room's point at the origin of the scene's cameras.

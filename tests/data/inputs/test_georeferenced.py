@@ -16,13 +16,14 @@ from tests.data.inputs import room
 from tests.data.test_scene import views_of
 from tests.scene_writers import write_points
 
-UTM = np.array([500_000.0, 4_600_000.0, 120.0])
+OFFSET = (500_000.0, 4_600_000.0, 120.0)
+UTM = np.array(OFFSET)
 SHIFTED = np.concatenate([np.eye(3), -UTM[:, None]], axis=1)  # the applied_transform of a local file
 TURNED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]) @ np.vstack([SHIFTED, [0, 0, 0, 1]])
 
 
 def colmap(path, names):
-    return room.write_colmap(path, names, offset=UTM)
+    return room.write_colmap(path, names, offset=OFFSET)
 
 
 def world_transforms(path, names):

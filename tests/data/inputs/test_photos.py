@@ -2,7 +2,9 @@
 
 import struct
 import zlib
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,7 +95,9 @@ def pfm(file, photo):
 
 def lab(file, photo):
     profiles = ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB")
-    ImageCms.profileToProfile(Image.fromarray(photo), *profiles, outputMode="LAB").save(file)
+    image = ImageCms.profileToProfile(Image.fromarray(photo), *profiles, outputMode="LAB")
+    assert image is not None
+    image.save(file)
 
 
 def bits(file, photo, **options):
@@ -133,7 +137,7 @@ FLOATS = "expected 8 or 16 bits a channel, got floats, whose range is unknown; c
 INTEGERS = "expected 8 or 16 bits a channel, got signed or 32-bit integers, whose range is unknown; convert it"
 UNKNOWN = "could not decode it: no format is known; photos have 8 or 16 bits a channel"
 # Suffix, writer, and the right pixels or the refusal.
-KINDS = {
+KINDS: dict[str, tuple[str, Callable[..., None], Any]] = {
     **{f"{suffix} of RGB": (suffix, save, same) for suffix in ("png", "bmp", "ppm", "tga", "tif")},
     "jpg": ("jpg", partial(save, quality=98, subsampling=0), same),
     "jpg of YCbCr 4:2:0": ("jpg", partial(save, quality=98), same),
