@@ -111,6 +111,11 @@ class Capture:
         if origin.any():
             photos = [dataclasses.replace(photo, viewmat=moved(photo.viewmat, origin)) for photo in photos]
             cloud = cloud and cloud.moved(origin)
+            warnings.warn(
+                f"{source}: too far from its world's origin for single precision; cameras and points are relative to "
+                f"{tuple(origin.tolist())}, the scene's `origin`",
+                stacklevel=2,
+            )
         return cls(source, photos, cloud, origin, test, background)
 
 

@@ -18,6 +18,7 @@ from tests.scene_writers import write_points
 
 OFFSET = (500_000.0, 4_600_000.0, 120.0)
 UTM = np.array(OFFSET)
+ANNOUNCED = "ignore:.*cameras and points are relative to:UserWarning"
 SHIFTED = np.concatenate([np.eye(3), -UTM[:, None]], axis=1)  # the applied_transform of a local file
 TURNED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]) @ np.vstack([SHIFTED, [0, 0, 0, 1]])
 
@@ -65,6 +66,13 @@ def point_error(scene, world: np.ndarray) -> float:
     return float(np.abs(scene.points.double().numpy() + scene.origin.numpy() - world).max())
 
 
+def test_a_frame_of_its_own_is_announced(tmp_path):
+    names = room.write_photos(tmp_path / "images")
+    with pytest.warns(UserWarning, match=r"cameras and points are relative to \(5000\d\d.*, the scene's `origin`"):
+        load_scene(colmap(tmp_path, names))
+
+
+@pytest.mark.filterwarnings(ANNOUNCED)
 @pytest.mark.parametrize("write", [colmap, world_transforms, applied(SHIFTED), applied(TURNED)])
 def test_photos_and_points_keep_their_pixels(tmp_path, write):
     names = room.write_photos(tmp_path / "images")
@@ -78,6 +86,7 @@ def test_photos_and_points_keep_their_pixels(tmp_path, write):
     assert point_error(load_scene(tmp_path, points=str(tmp_path / "other.ply")), room.wall_points(50, 7) + UTM) < 1e-5
 
 
+@pytest.mark.filterwarnings(ANNOUNCED)
 def test_a_frame_of_its_own_changes_nothing_else(tmp_path):
     """The local scene has no offset; the same at UTM coordinates has the same cameras, scale and depths."""
     names = room.write_photos(tmp_path / "images")
@@ -105,6 +114,7 @@ def test_tensors_in_float64_get_a_frame_and_those_in_float32_a_warning(tmp_path)
         nw.Scene.from_tensors(photos, [camera.to(torch.float32) for camera in cameras])
 
 
+@pytest.mark.filterwarnings(ANNOUNCED)
 def test_a_model_says_its_frame_and_exports_cameras_of_the_world(tmp_path):
     names = room.write_photos(tmp_path / "images")
     scene, run = load_scene(colmap(tmp_path, names)), tmp_path / "run"
