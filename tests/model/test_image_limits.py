@@ -22,6 +22,7 @@ from nexwarp.ops import _interop, memory, tiles
 from nexwarp.run.folder import RunRecord, create_run
 from nexwarp.train.trainer import Trainer
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.tolerances import assert_close
 from tests.trainer_support import small
 
 GIB = 2**30
@@ -254,6 +255,14 @@ def test_a_background_must_be_finite(value):
             nw.render(surfels, texture, camera, background=torch.tensor([0.0, value, 0.0]).requires_grad_())
         with pytest.raises(ValueError, match=r"^background: expected finite values, got -?(nan|inf) at index \(\)$"):
             nw.render(surfels, texture, camera, background=torch.tensor(value))
+
+
+def test_a_background_may_lie_outside_of_0_to_1():
+    surfels, texture, camera = parts()
+    dark, bright = (nw.render(surfels, texture, camera, background=color) for color in ((-0.5,) * 3, (1.5,) * 3))
+    behind = 2.0 * (1.0 - bright.alpha)[..., None].expand(-1, -1, 3)
+    assert_close(bright.image - dark.image, behind, kind="value", name="image")
+    assert nw.RenderOptions(background=(-0.5, 0.0, 1.5)).background == (-0.5, 0.0, 1.5)
 
 
 def moved(camera: nw.Camera, K: torch.Tensor) -> nw.Camera:
