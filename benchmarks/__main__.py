@@ -9,6 +9,7 @@ STAGES: dict[str, suite.Stage] = {
     "project": on_each_scene(bench_collect.project),
     "tiles": on_each_scene(bench_collect.tiles),
     "collect": on_each_scene(bench_collect.collect),
+    "rasterize": on_each_scene(bench_collect.rasterize),
     "texture": on_each_scene(bench_texture.texturing),
     "frame": on_each_scene(bench_frame.frame),
     "train_step": bench_train_step.run,

@@ -1,10 +1,12 @@
 """The collection stage and its parts, K = 2: plain colours and projection, tile lists, the walk along them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import torch
 
+import nexwarp as nw
 from benchmarks.scenes import SurfelScene, cloud, entries, geometry, outputs, random_like
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, ratio
@@ -66,6 +68,43 @@ def stage(scene: SurfelScene, options: Options) -> Measurement:
         lambda: torch.autograd.grad(outputs(g.hits(MAX_HITS)), g.leaves, signals),
         **scene.facts,
     )
+
+
+def rasterize(scene: SurfelScene, options: Options) -> list[Measurement]:
+    """`nw.rasterize`, forward + backward, with 3 and 16 channels, against the passes of a training step."""
+    g = geometry(scene)
+    wide = torch.rand(len(g.colors), 16, device=g.colors.device, requires_grad=True)
+
+    def trained(colors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        hits = replace(g, colors=colors).hits(MAX_HITS)
+        return (*outputs(hits), *ops.unproject(hits.depths, g.viewmat, g.pinhole))
+
+    def plain(colors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        hits = nw.rasterize(*g.shape, colors, scene.camera, MAX_HITS)
+        return (*outputs(hits), hits.points, hits.directions)
+
+    def timed(name: str, run: Callable[[torch.Tensor], tuple[torch.Tensor, ...]], colors: torch.Tensor) -> Measurement:
+        leaves, results = (*g.shape, colors), differentiable(run(colors))
+        signals = random_like(results)
+        return options.time(
+            name, lambda: torch.autograd.grad(differentiable(run(colors)), leaves, signals), **scene.facts
+        )
+
+    passes = timed("passes of a training step, forward + backward", trained, g.colors)
+    three = timed("rasterize, 3 channels, forward + backward", plain, g.colors)
+    sixteen = timed("rasterize, 16 channels, forward + backward", plain, wide)
+    return [
+        passes,
+        three,
+        sixteen,
+        ratio("rasterize, 3 channels, over the passes", three, passes),
+        ratio("rasterize, 16 channels, over the passes", sixteen, passes),
+    ]
+
+
+def differentiable(results: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
+    """Return those results that have a gradient."""
+    return tuple(x for x in results if x.requires_grad)
 
 
 def backward(
