@@ -11,8 +11,8 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from nexwarp.data import Scene, View, load_scene
-from nexwarp.data.demo import demo_folder
 from nexwarp.data.lens import Lens, pycolmap_module
+from nexwarp.data.scene import demo_folder
 from nexwarp.io.pictures import save_png, to_uint8
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -1,8 +1,20 @@
-"""COLMAP models: search for their files, and conversion of their records to photos and points."""
+"""COLMAP models, binary and text: search for their files, and conversion of their records to photos and points.
 
+pycolmap's reader is not used: it allocates memory for a count before it checks the file's size, reads past the end of
+a truncated file, aborts the process on some damaged files, and creates a Python object for each point. Rigs and frames,
+which repeat the poses of the images, are not read.
+"""
+
+import codecs
 import dataclasses
+import struct
 import warnings
+from array import array
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -17,20 +29,47 @@ from nexwarp.data.capture import (
     inside_folder,
     safe_name,
 )
-from nexwarp.data.colmap_files import (
-    CameraRecord,
-    ImageRecord,
-    PointRecords,
-    Records,
-    count_images,
-    read_records,
-)
-from nexwarp.data.lens import Lens
+from nexwarp.data.lens import Lens, camera_models
 from nexwarp.data.ply import read_ply
 
 PARTS = ("cameras", "images", "points3D")
 FORMATS = ("bin", "txt")
 POINTS_PLY = "points3D.ply"  # of MASt3R's and DUSt3R's exporters, and of 3DGS
+MAX_CAMERAS = MAX_IMAGES = 100_000
+MAX_POINTS = 10_000_000
+LARGEST_ID = 2**32 - 1  # of an image, as binary files hold it
+MAX_OBSERVATIONS = 100_000_000
+MAX_NAME = 4096  # bytes
+MAX_LINE = 64 * 2**20  # bytes of a line of a text file, enough for a million keypoints
+KEYPOINT_BYTES = b"0123456789+-.eEinfaINFA \t"  # of numbers, nan and inf
+CAMERA, IMAGE, POINT = struct.Struct("<IiQQ"), struct.Struct("<I7dI"), struct.Struct("<Q3d3BdQ")
+POINTS = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
+
+CameraRecord: TypeAlias = tuple[str, tuple[float, ...], int, int]  # the arguments of `Lens`
+Record = TypeVar("Record")
+
+
+class ImageRecord(NamedTuple):
+    """A registered image: rotation wxyz, not normalised, and translation (7,), world to camera; camera's id; name."""
+
+    pose: tuple[float, ...]
+    camera: int
+    name: str
+
+
+@dataclass(frozen=True)
+class PointRecords:
+    """Points by ascending id.
+
+    Attributes:
+        table: (P,) of `POINTS`: world positions, colours, mean reprojection errors in pixels, numbers of observations.
+        seen_by: (E,) uint32, image ids of the observations, in the order of `points`.
+        points: (E,) int32, index of the point of each observation.
+    """
+
+    table: np.ndarray
+    seen_by: np.ndarray
+    points: np.ndarray
 
 
 def _folders(path: Path) -> list[Path]:
@@ -40,19 +79,15 @@ def _folders(path: Path) -> list[Path]:
 
 
 def has_model(path: Path) -> bool:
-    """Whether a file of a COLMAP model exists in a folder that `find_model` searches."""
+    """Whether a file of a COLMAP model exists in a folder that `read_model` searches."""
     return any((folder / f"{part}.{end}").is_file() for folder in _folders(path) for part in PARTS for end in FORMATS)
 
 
-def find_model(path: Path, need_points: bool = True) -> tuple[Path, str, Path | None]:
+def _find_model(path: Path, need_points: bool) -> tuple[Path, str, Path | None]:
     """Return the folder of a scene's COLMAP model, its format, "bin" (preferred) or "txt", and the file of its points.
 
     Points lie in points3D.bin or .txt, as the model, else in points3D.ply; None without any. Of several models it is
-    the one with the most registered photos, else the first of sparse/0, sparse/1 and so on, sparse and `path` itself.
-
-    Raises:
-        FileNotFoundError: there is no complete model; the message names the missing files of a partial one. Points are
-            a part of it if `need_points`.
+    the one with the most registered photos, else the first of `_folders`.
     """
     partial = None
     models: list[tuple[Path, str, Path | None]] = []
@@ -71,7 +106,7 @@ def find_model(path: Path, need_points: bool = True) -> tuple[Path, str, Path | 
                 partial = f"{path}: incomplete COLMAP model in {folder}: {' and '.join(missing)} not found"
                 partial += "; --points FILE.ply stands in for it" if missing == [own.name] else ""
     if models:
-        return models[0] if len(models) == 1 else max(models, key=lambda model: count_images(*model[:2]))
+        return models[0] if len(models) == 1 else max(models, key=lambda model: _count_images(*model[:2]))
     raise FileNotFoundError(
         partial
         or f"{path}: no COLMAP model found, expected cameras, images and points3D (.bin or .txt) "
@@ -80,43 +115,33 @@ def find_model(path: Path, need_points: bool = True) -> tuple[Path, str, Path | 
 
 
 def read_model(path: Path, images: Path, follow_links: bool = False, need_points: bool = True) -> Capture:
-    """Read the COLMAP model of a scene.
+    """Read the COLMAP model of a scene in `path`, whose photos lie in `images`.
 
-    Args:
-        path: folder of the scene.
-        images: folder of its photos.
-        follow_links: see `load_scene`.
-        need_points: refuse a model without a file of points; one of no points is accepted.
+    With `need_points` a model without a file of points is refused; one of no points is accepted.
 
     Raises:
-        FileNotFoundError: there is no model.
+        FileNotFoundError: there is no complete model; the message names the missing files of a partial one.
         ValueError: the model is damaged, has no registered image, an invalid camera or pose, an image name that leaves
             the images folder or occurs twice, or points that are not finite.
     """
-    folder, suffix, points = find_model(path, need_points)
-    in_ply = points is not None and points.name == POINTS_PLY
-    records = read_records(folder, suffix, points is not None and not in_ply)
-    cloud = read_ply(inside_folder(f"{folder}:", points, path, follow_links)) if points is not None and in_ply else None
-    return capture_of(records, folder, images, follow_links, cloud)
-
-
-def capture_of(records: Records, folder: Path, images: Path, follow_links: bool, cloud: Cloud | None = None) -> Capture:
-    """Convert the records of a model; `cloud` has the points of records without any.
-
-    `folder` names the model in messages. Other arguments and errors are those of `read_model`.
-    """
-    if not records.images:
+    folder, suffix, points_file = _find_model(path, need_points)
+    in_ply = points_file is not None and points_file.name == POINTS_PLY
+    read = _read_binary if suffix == "bin" else _read_text
+    cameras, records, points = read(folder, points_file is not None and not in_ply)
+    cloud = None
+    if points_file is not None and in_ply:
+        cloud = read_ply(inside_folder(f"{folder}:", points_file, path, follow_links))
+    if not records:
         raise ValueError(f"{folder}: the COLMAP model has no registered images")
     lenses: dict[int, Lens] = {}
-    each = (_photo(image, records.cameras, lenses, folder, images, follow_links) for image in records.images.values())
+    each = (_photo(image, cameras, lenses, folder, images, follow_links) for image in records.values())
     photos = distinct_photos(folder, each)
-    points = records.points
-    if points is None or not len(points.ids):
+    if points is None or not len(points.table):
         return Capture.of(folder, photos, cloud)
-    points = _without_strays(points, records.images, folder)
-    capture = Capture.of(folder, photos, _cloud(points, folder))
+    points = _without_strays(points, records, folder)
+    capture = Capture.of(folder, photos, _cloud(points.table, folder))
     assert capture.cloud is not None
-    seen = _seen(points, records.images, capture.cloud.positions.astype(np.float32))
+    seen = _seen(points, records, capture.cloud.positions.astype(np.float32))
     points_of = {photo.name: positions for photo, positions in zip(photos, seen, strict=True)}
     photos = [dataclasses.replace(photo, points=points_of[photo.name]) for photo in capture.photos]
     return dataclasses.replace(capture, photos=photos)
@@ -172,34 +197,271 @@ def _without_strays(points: PointRecords, images: dict[int, ImageRecord], folder
         stacklevel=2,
     )
     kept = points.points[known]
-    lengths = np.bincount(kept, minlength=len(points.ids))
-    return dataclasses.replace(points, seen_by=points.seen_by[known], points=kept, lengths=lengths)
+    points.table["length"] = np.bincount(kept, minlength=len(points.table))
+    return PointRecords(points.table, points.seen_by[known], kept)
 
 
 def _seen(points: PointRecords, images: dict[int, ImageRecord], positions: np.ndarray) -> list[np.ndarray]:
     """For each image, those (M, 3) of the positions (P, 3) that were triangulated from it, by ascending id."""
+    count = len(positions)
     identities = np.array(list(images), np.int64)
     ascending = np.argsort(identities)
     # Observations are the largest arrays of a model, so they are processed in place.
     pairs = np.searchsorted(identities[ascending].astype(np.uint32), points.seen_by)
     # Sort by image, then by point, and remove duplicates.
-    pairs *= len(points.ids)
+    pairs *= count
     pairs += points.points
     pairs.sort()
     pairs = pairs[np.concatenate([[True], pairs[1:] != pairs[:-1]])[: len(pairs)]]
-    ends = np.searchsorted(pairs, np.arange(1, len(identities)) * len(points.ids))
-    seen: list[np.ndarray] = [positions[part % len(points.ids)] for part in np.split(pairs, ends)]
-    order = np.empty_like(ascending)
-    order[ascending] = np.arange(len(ascending))
-    return [seen[index] for index in order]
+    ends = np.searchsorted(pairs, np.arange(1, len(identities)) * count)
+    seen: list[np.ndarray] = [positions[part % count] for part in np.split(pairs, ends)]
+    return [seen[index] for index in np.argsort(ascending)]
 
 
-def _cloud(points: PointRecords, folder: Path) -> Cloud:
-    check_points(folder, points.positions, "3D points", lambda index: f"point id {points.ids[index]}")
-    bad = ~(np.abs(points.errors) <= LARGEST_COORDINATE)
+def _cloud(table: np.ndarray, folder: Path) -> Cloud:
+    def name(index: int) -> str:
+        return f"point id {table['id'][index]}"
+
+    positions, errors = np.ascontiguousarray(table["xyz"]), table["error"]
+    check_points(folder, positions, "3D points", name)
+    bad = ~(np.abs(errors) <= LARGEST_COORDINATE)
     if bad.any():
         index = int(np.flatnonzero(bad)[0])
-        raise ValueError(
-            f"{folder}: expected finite reprojection errors, got {points.errors[index]} (point id {points.ids[index]})"
-        )
-    return Cloud(points.positions, points.colors, points.lengths.astype(np.int32), points.errors.astype(np.float32))
+        raise ValueError(f"{folder}: expected finite reprojection errors, got {errors[index]} ({name(index)})")
+    colors = np.ascontiguousarray(table["rgb"])
+    return Cloud(positions, colors, table["length"].astype(np.int32), errors.astype(np.float32))
+
+
+# Binary files
+
+
+def _read_binary(
+    folder: Path, points: bool
+) -> tuple[dict[int, CameraRecord], dict[int, ImageRecord], PointRecords | None]:
+    """Read cameras and images by id, and the points, if wanted; ValueError names a damaged file."""
+    with _opened(folder / "cameras.bin") as file:
+        cameras = _unique(file.path, (_binary_camera(file) for _ in range(file.count(MAX_CAMERAS))))
+    with _opened(folder / "images.bin") as file:
+        images = _unique(file.path, (_binary_image(file) for _ in range(file.count(MAX_IMAGES))))
+    if not points:
+        return cameras, images, None
+    with _opened(folder / "points3D.bin") as file:
+        return cameras, images, _binary_points(file)
+
+
+def _count_images(folder: Path, suffix: str) -> int:
+    """Number of registered images of the model in a folder, "bin" or "txt"."""
+    if suffix == "txt":
+        return sum(1 for _ in _text_images(folder / "images.txt"))
+    with (folder / "images.bin").open("rb") as file:
+        return _Reader(folder / "images.bin", file).count(MAX_IMAGES)
+
+
+class _Reader:
+    """Reads a binary file with checks against its size: it never reads or allocates beyond it."""
+
+    def __init__(self, path: Path, file: BinaryIO) -> None:
+        self.path, self.file, self.size = path, file, path.stat().st_size
+        self.position = 0
+
+    def read(self, size: int) -> bytes:
+        self._advance(size)
+        data = self.file.read(size)
+        if len(data) < size:
+            raise self._short()
+        return data
+
+    def skip(self, size: int) -> None:
+        self._advance(size)
+        self.file.seek(self.position)
+
+    def number(self) -> int:
+        return int.from_bytes(self.read(8), "little")
+
+    def count(self, limit: int) -> int:
+        count = self.number()
+        if count > self.size - self.position:  # each record has at least one byte
+            raise self._short()
+        if count > limit:
+            raise ValueError(f"{self.path}: expected at most {limit:,} records, got {count:,}")
+        return count
+
+    def text(self) -> bytes:
+        """Read bytes up to a zero."""
+        start = self.position
+        data, zero, _ = self.file.read(MAX_NAME + 1).partition(b"\0")
+        if not zero and start + MAX_NAME < self.size:
+            raise ValueError(f"{self.path}: damaged, expected image names of at most {MAX_NAME} bytes")
+        self.skip(len(data) + 1)
+        return data
+
+    def _advance(self, size: int) -> None:
+        self.position += size
+        if self.position > self.size:
+            raise self._short()
+
+    def _short(self) -> ValueError:
+        return ValueError(f"{self.path}: truncated or damaged, expected more records than the file holds")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Reader]:
+    """Open a binary file that is to be read to its end."""
+    with path.open("rb") as file:
+        reader = _Reader(path, file)
+        yield reader
+    if reader.position != reader.size:
+        raise ValueError(f"{path}: damaged, expected {reader.position:,} bytes as its counts say, got {reader.size:,}")
+
+
+def _unique(path: Path, records: Iterator[tuple[int, Record]]) -> dict[int, Record]:
+    """Collect records by id; ValueError if an id occurs twice or there are too many."""
+    by_id: dict[int, Record] = {}
+    for identity, record in records:
+        if identity in by_id:
+            raise ValueError(f"{path}: damaged, expected each id once, got {identity} twice")
+        by_id[identity] = record
+        if len(by_id) > MAX_IMAGES:
+            raise ValueError(f"{path}: expected at most {MAX_IMAGES:,} records, got more")
+    return by_id
+
+
+def _binary_camera(file: _Reader) -> tuple[int, CameraRecord]:
+    identity, model, width, height = CAMERA.unpack(file.read(CAMERA.size))
+    if model not in camera_models():
+        raise ValueError(f"{file.path}: camera {identity}: expected a camera model that COLMAP knows, got {model}")
+    name, count = camera_models()[model]
+    return identity, (name, struct.unpack(f"<{count}d", file.read(8 * count)), width, height)
+
+
+def _binary_image(file: _Reader) -> tuple[int, ImageRecord]:
+    identity, *pose, camera = IMAGE.unpack(file.read(IMAGE.size))
+    name = _decoded(file.path, file.text())
+    file.skip(24 * file.number())  # keypoints
+    return identity, ImageRecord(tuple(pose), camera, name)
+
+
+def _binary_points(file: _Reader) -> PointRecords:
+    heads, tracks = bytearray(), bytearray()
+    for _ in range(file.count(MAX_POINTS)):
+        head = file.read(POINT.size)
+        heads += head
+        if length := int.from_bytes(head[-8:], "little"):
+            _check_observations(file.path, len(tracks) // 8 + length)
+            tracks += file.read(8 * length)
+    return _sorted(file.path, heads, np.frombuffer(tracks, "<u4")[::2].copy())
+
+
+# Text files
+
+
+def _read_text(
+    folder: Path, points: bool
+) -> tuple[dict[int, CameraRecord], dict[int, ImageRecord], PointRecords | None]:
+    """As `_read_binary`; messages name the line, too."""
+    lines = _lines(folder / "cameras.txt")
+    cameras = _unique(folder / "cameras.txt", (_text_camera(where, line) for where, line in lines))
+    images = _unique(folder / "images.txt", _text_images(folder / "images.txt"))
+    return cameras, images, _text_points(folder / "points3D.txt") if points else None
+
+
+def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Yield each line with its place for messages, without a byte order mark, comments and empty lines."""
+    with path.open("rb") as file:
+        number = 0
+        while line := file.readline(MAX_LINE):
+            number += 1
+            if len(line) == MAX_LINE:
+                raise ValueError(f"{path}: line {number}: expected at most {MAX_LINE:,} bytes")
+            line = line.removeprefix(codecs.BOM_UTF8).strip()
+            if line and not line.startswith(b"#"):
+                yield f"{path}: not a readable COLMAP model: line {number}", line
+
+
+def _unreadable(where: str, expected: str, line: bytes) -> ValueError:
+    return ValueError(f"{where}: expected {expected}, got {line[:60].decode('ascii', 'backslashreplace')!r}")
+
+
+def _integers(words: Sequence[bytes]) -> list[int]:
+    """Integers of words such as 12, 12.0 and 1.2e1; ValueError for other numbers."""
+    try:
+        return [int(word) for word in words]
+    except ValueError:
+        numbers = [float(word) for word in words]
+        if not all(number.is_integer() for number in numbers):
+            raise
+        return [int(number) for number in numbers]
+
+
+def _text_camera(where: str, line: bytes) -> tuple[int, CameraRecord]:
+    try:
+        identity, model, width, height, *params = line.split()
+        known = {name.encode(): count for name, count in camera_models().values()}
+        if known.get(model) != len(params):
+            raise ValueError
+        number, columns, rows = _integers((identity, width, height))
+        return number, (model.decode(), tuple(map(float, params)), columns, rows)
+    except ValueError:
+        expected = "id, model, width, height and the model's parameters of a camera"
+        raise _unreadable(where, expected, line) from None
+
+
+def _text_images(path: Path) -> Iterator[tuple[int, ImageRecord]]:
+    """Read images; their lines of keypoints, which some programs leave out, are told by their content."""
+    for where, line in _lines(path):
+        if not line.translate(None, KEYPOINT_BYTES) and len(line.split()) % 3 == 0:
+            continue  # triples of x, y and a point's id
+        try:
+            *numbers, name = line.split(None, 9)
+            pose = tuple(map(float, numbers[1:8]))
+            identity, camera = _integers((numbers[0], numbers[8]))
+            if not 0 <= identity <= LARGEST_ID:
+                raise ValueError
+        except (ValueError, IndexError):
+            raise _unreadable(where, "id, pose, camera and name of an image, or its keypoints", line) from None
+        yield identity, ImageRecord(pose, camera, _decoded(path, name))
+
+
+def _text_points(path: Path) -> PointRecords:
+    heads, seen_by = bytearray(), array("I")
+    for where, line in _lines(path):
+        words = line.split()
+        try:
+            x, y, z, error = map(float, (*words[1:4], words[7]))
+            identity, *color = _integers((words[0], *words[4:7]))
+            seen_by.extend(_integers(words[8::2]))
+            heads += POINT.pack(identity, x, y, z, *color, error, len(words[8::2]))
+            if len(words) % 2:
+                raise ValueError
+        except (ValueError, IndexError, OverflowError, struct.error):
+            raise _unreadable(where, "id, position, colour, error and track of a point", line) from None
+        if len(heads) > MAX_POINTS * POINT.size:
+            raise ValueError(f"{path}: expected at most {MAX_POINTS:,} points, got more")
+        _check_observations(path, len(seen_by))
+    return _sorted(path, heads, np.frombuffer(seen_by, np.uint32))
+
+
+def _sorted(path: Path, heads: bytearray, seen_by: np.ndarray) -> PointRecords:
+    """Sort points by ascending id, so that binary and text models give the same result."""
+    table = np.frombuffer(heads, POINTS)
+    order = np.argsort(table["id"], kind="stable")
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order))
+    points = np.repeat(rank, table["length"].astype(np.int64))
+    table = table[order]
+    twice = np.flatnonzero(table["id"][1:] == table["id"][:-1])
+    if len(twice):
+        raise ValueError(f"{path}: damaged, expected each id once, got {table['id'][twice[0]]} twice")
+    return PointRecords(table, seen_by, points)
+
+
+def _check_observations(path: Path, count: int) -> None:
+    if count > MAX_OBSERVATIONS:
+        raise ValueError(f"{path}: expected at most {MAX_OBSERVATIONS:,} observations, got more")
+
+
+def _decoded(path: Path, name: bytes) -> str:
+    try:
+        return name.decode("utf-8")
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: expected image names in UTF-8, got {name[:60]!r}") from None

@@ -7,7 +7,6 @@ import math
 import signal
 import sys
 import threading
-from collections import OrderedDict
 from dataclasses import dataclass
 from functools import lru_cache
 from types import ModuleType
@@ -29,7 +28,6 @@ NEWTON_STEPS, NEWTON_DELTA = 50, 1e-7
 MAX_SIDE = 2**16  # pixels, of an undistorted image
 MIN_FOCAL, MAX_PARAMETER = 1e-3, 1e9  # pixels; rays and pixels stay finite in single precision
 ROWS = 128  # rows of a map that are computed at a time, as their rays are float64
-KEPT_MAPS = 6  # for the faces of a panorama
 BORDER = 0.5  # pixels outside a photo that take the colour of its edge
 
 # Rotations from a panorama's frame to its six faces of 90 degrees, x right, y down, z forward.
@@ -70,24 +68,19 @@ def camera_models() -> dict[int, tuple[str, int]]:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Intrinsics and size of an image without distortion.
+    """Intrinsics and size of an image without distortion, in pixels, pixel centres at +0.5."""
 
-    Attributes:
-        K: (3, 3) float64, in pixels, pixel centres at +0.5.
-        width: width of the image in pixels.
-        height: height of the image in pixels.
-    """
-
-    K: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
     width: int
     height: int
 
     def resized(self, width: int, height: int) -> "Intrinsics":
         """Return the intrinsics of the same view with another size; each axis is scaled on its own."""
-        K = self.K.copy()
-        K[0] *= width / self.width
-        K[1] *= height / self.height
-        return Intrinsics(K, width, height)
+        x, y = width / self.width, height / self.height
+        return Intrinsics(self.fx * x, self.fy * y, self.cx * x, self.cy * y, width, height)
 
 
 @dataclass(frozen=True)
@@ -147,27 +140,26 @@ class Lens:
         """
         if self.model == PANORAMA:
             side = max(round(self.width / math.pi), 1)
-            K = np.array([[side / 2, 0.0, side / 2], [0.0, side / 2, side / 2], [0.0, 0.0, 1.0]])
-            return Intrinsics(K, side, side)
-        K = self._matrix()
+            return Intrinsics(side / 2, side / 2, side / 2, side / 2, side, side)
+        focal, centre = self._pinhole()
         if not self.distorted:
-            return Intrinsics(K, self.width, self.height)
+            return Intrinsics(focal[0], focal[1], centre[0], centre[1], self.width, self.height)
         photo, sides = (self.width, self.height), [1, 1]
-        for axis in (0, 1):
-            side, focal, centre = photo[axis], K[axis, axis], K[axis, 2]
+        for axis, side in enumerate(photo):
+            middle = centre[axis]
             border = np.empty((photo[1 - axis], 2))
             border[:, 1 - axis] = np.arange(photo[1 - axis]) + 0.5
             border[:, axis] = 0.5
-            first = centre + focal * self._tangents(border, axis, -math.inf).max()
+            first = middle + focal[axis] * self._tangents(border, axis, -math.inf).max()
             border[:, axis] = side - 0.5
-            last = centre + focal * self._tangents(border, axis, math.inf).min()
+            last = middle + focal[axis] * self._tangents(border, axis, math.inf).min()
             with np.errstate(divide="ignore"):
-                scale = 1 / np.maximum(centre / (centre - first), (side - 0.5 - centre) / (last - centre))
+                scale = 1 / np.maximum(middle / (middle - first), (side - 0.5 - middle) / (last - middle))
             sides[axis] = max(int(side * np.clip(np.nan_to_num(scale, nan=1.0), LEAST_SCALE, MOST_SCALE)), 1)
-            K[axis, 2] *= sides[axis] / side
+            centre[axis] *= sides[axis] / side
         if max(sides) > MAX_SIDE:
             raise ValueError(f"camera model {self.model}: cannot undistort with the parameters {self.params}")
-        return Intrinsics(K, *sides)
+        return Intrinsics(focal[0], focal[1], centre[0], centre[1], sides[0], sides[1])
 
     def _tangents(self, pixels: np.ndarray, axis: int, beyond: float) -> np.ndarray:
         """Positions (N,) along an axis at depth 1 of pixels (N, 2); `beyond` where the lens sees more than 180 degrees.
@@ -215,12 +207,12 @@ class Lens:
         bent_y = y * radial + 2 * p2 * x * y + p1 * (r + 2 * y * y)
         return np.stack([bent_x, bent_y], axis=1)
 
-    def _matrix(self) -> np.ndarray:
-        """(3, 3) float64 intrinsics without the distortion."""
-        if self.model != BROWN:
-            return np.array(self._camera().calibration_matrix())
-        fx, fy, cx, cy = self.params[:4]
-        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    def _pinhole(self) -> tuple[list[float], list[float]]:
+        """Focal lengths and principal point without the distortion."""
+        if self.model == BROWN:
+            return list(self.params[:2]), list(self.params[2:4])
+        K = self._camera().calibration_matrix()
+        return [K[0, 0], K[1, 1]], [K[0, 2], K[1, 2]]
 
     def _camera(self) -> "pycolmap.Camera":
         camera: pycolmap.Camera = pycolmap_module().Camera(
@@ -263,25 +255,6 @@ class Map:
         return out if self.valid is None else out & self.valid
 
 
-class Maps:
-    """A thread-safe cache of the most recent maps, for photos that share a lens."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._maps: OrderedDict[tuple[Lens, int, int, bytes, str | None], Map] = OrderedDict()
-
-    def get(self, lens: Lens, target: Intrinsics, face: str | None) -> Map:
-        """Return the map from an undistorted image to a photo; `face` is the face of a panorama, a key of `FACES`."""
-        key = (lens, target.width, target.height, target.K.tobytes(), face)
-        with self._lock:
-            if key not in self._maps:
-                self._maps[key] = _map(lens, target, face)
-            self._maps.move_to_end(key)
-            while len(self._maps) > KEPT_MAPS:
-                self._maps.popitem(last=False)
-            return self._maps[key]
-
-
 @lru_cache(maxsize=256)
 def _reach(lens: Lens) -> float:
     """Tangent of the angle from the axis up to which a lens is one to one; polynomials turn back beyond."""
@@ -295,13 +268,14 @@ def _reach(lens: Lens) -> float:
     return math.inf if farther.all() else float(tangents[max(int(np.argmin(farther)) - 1, 0)])
 
 
-def _map(lens: Lens, target: Intrinsics, face: str | None) -> Map:
+def undistortion(lens: Lens, target: Intrinsics, face: str | None) -> Map:
+    """Return the map from an undistorted image to a photo; `face` is the face of a panorama, a key of `FACES`."""
     grid = np.empty((target.height, target.width, 2), np.float32)
     valid = np.empty((target.height, target.width), bool)
-    x = (np.arange(target.width) + 0.5 - target.K[0, 2]) / target.K[0, 0]
+    x = (np.arange(target.width) + 0.5 - target.cx) / target.fx
     for top in range(0, target.height, ROWS):
         rows = slice(top, min(top + ROWS, target.height))
-        y = (np.arange(rows.start, rows.stop) + 0.5 - target.K[1, 2]) / target.K[1, 1]
+        y = (np.arange(rows.start, rows.stop) + 0.5 - target.cy) / target.fy
         rays = np.ones((len(y), len(x), 3))
         rays[..., 0], rays[..., 1] = x, y[:, None]
         if face is not None:

@@ -17,19 +17,17 @@ import torch
 from tyro.conf import Positional, arg
 
 from nexwarp.cameras.camera import Array, Camera
-from nexwarp.data.background import parse_color
 from nexwarp.data.capture import Capture, Cloud, Photo, report_missing, report_unused, safe_name, scene_errors
 from nexwarp.data.colmap import has_model, read_model
-from nexwarp.data.demo import demo_folder
 from nexwarp.data.images import quiet_pillow
 from nexwarp.data.in_memory import as_bytes, make_cloud, near_origin, split_views
-from nexwarp.data.memory import check_memory
 from nexwarp.data.ply import read_ply
 from nexwarp.data.random_points import random_points
 from nexwarp.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, read_blender, read_nerfstudio
 from nexwarp.data.views import PlannedView, View, ViewReader, find_mask
 from nexwarp.errors import MissingError
 from nexwarp.io.pictures import save_png
+from nexwarp.machine import available_memory
 
 if TYPE_CHECKING:
     import pycolmap
@@ -46,10 +44,23 @@ RANDOM = "random"
 # Host memory that reading takes while it goes on, in bytes a pixel of the photo as it lies in its file.
 READ_BYTES, UNDISTORT_BYTES = 24, 64
 MAX_READERS = 32
+GIB = 2**30
+SHARE = 0.9  # largest share of the free memory for photos
+MAX_DOWNSCALE = 64  # that a message names
+COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 ProgressCallback = Callable[[int, int], None]
+
+
+def demo_folder() -> Path:
+    """Return the folder of the built-in scene `demo`, a COLMAP scene of 40 photos; its files are not to be changed.
+
+    It is ours: traced by nexwarp/data/raytrace.py of commit 7f7bd6c, the points with the noise and outliers of
+    structure from motion.
+    """
+    return Path(__file__).parent / "demo_scene"
 
 
 @dataclass(frozen=True)
@@ -107,7 +118,7 @@ class SceneSource:
     def photos(self) -> list[Photo]:
         """Read the photos' names, files and lenses, without pixels; errors are those of `load_scene`."""
         with quiet_pillow(), scene_errors():
-            return _read_capture(self, self._folder(), find_format(self._folder(), self.format)).photos
+            return _read_capture(self, self._folder()).photos
 
     def _folder(self) -> Path:
         return demo_folder() if self.path == DEMO else Path(self.path)
@@ -309,14 +320,13 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | No
     if source.downscale < 1:
         raise ValueError(f"downscale: expected at least 1, got {source.downscale}")
     random = isinstance(source.background, str) and source.background == RANDOM
-    color = parse_color("white" if random else source.background)
+    color = _parse_color("white" if random else source.background)
     with quiet_pillow(), scene_errors():
         if path.is_file():
             raise NotADirectoryError(f"{path}: expected the folder of a scene, got a file; give {path.parent}")
         if not path.is_dir():
             raise FileNotFoundError(f"{path}: no such folder, expected a scene: COLMAP, nerfstudio or Blender")
-        kind = find_format(path, source.format)
-        capture = _read_capture(source, path, kind)
+        capture = _read_capture(source, path)
         if len(capture.photos) < 2:
             raise ValueError(f"{capture.source}: expected at least 2 registered images (1 to train, 1 to test), got 1")
         cloud = capture.cloud
@@ -336,13 +346,23 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | No
     return dataclasses.replace(scene, random_background=random)
 
 
-def find_format(path: Path, format: str | None = None) -> str:
-    """Tell which kind of scene a folder holds: "colmap", "nerfstudio" or "blender".
+def _parse_color(color: str | Sequence[float] | None) -> tuple[float, float, float] | None:
+    """Three numbers in [0, 1] of a colour's name, of "R,G,B" or of three numbers; None stays None."""
+    if color is None:
+        return None
+    if isinstance(color, str) and color in COLORS:
+        return COLORS[color]
+    try:
+        values = tuple(float(x) for x in (color.split(",") if isinstance(color, str) else color))
+    except (TypeError, ValueError):
+        values = ()
+    if len(values) != 3 or not all(0 <= x <= 1 for x in values):
+        raise ValueError(f"background: expected white, black, random or three numbers in [0, 1], got {color!r}")
+    return values
 
-    Raises:
-        FileNotFoundError: none of them.
-        ValueError: more than one, or `format` is no such kind.
-    """
+
+def find_format(path: Path, format: str | None = None) -> str:
+    """Tell which kind of scene a folder holds, exactly one of `READERS`, or check `format`."""
     if format is not None:
         if format not in READERS:
             raise ValueError(f"format: expected one of {', '.join(READERS)}, got {format!r}")
@@ -428,7 +448,8 @@ def _given_points(file: Path, capture: Capture) -> Cloud:
     return cloud
 
 
-def _read_capture(source: SceneSource, path: Path, kind: str) -> Capture:
+def _read_capture(source: SceneSource, path: Path) -> Capture:
+    kind = find_format(path, source.format)
     if kind == "colmap":
         capture = read_model(path, path / source.images, source.follow_links, source.points is None)
         _check_folder("images", path, source.images)
@@ -479,16 +500,39 @@ def _scene_scale(source: str, viewmats: Sequence[np.ndarray], cloud: Cloud | Non
     return scale
 
 
+def photos_bytes(sizes: Sequence[tuple[int, int]], downscale: int, channels: int) -> int:
+    """Memory in bytes of photos of the given (width, height), reduced by `downscale`, with a byte a channel."""
+    return sum((width // downscale) * (height // downscale) * channels for width, height in sizes)
+
+
 def _workers(source: SceneSource, path: Path, channels: int, jobs: list[PlannedView]) -> int:
-    """How many photos to read at a time, so that what reading takes beside them fits as well."""
+    """How many photos to read at a time, so that what reading takes beside them fits as well.
+
+    ValueError: the photos do not fit; the message suggests a downscale or a folder of smaller images.
+    """
     sizes = [(job.target.width, job.target.height) for job in jobs]
-    free = check_memory(path, source.images, sizes, source.downscale, channels)
+    free = available_memory()
+    limit = int(SHARE * free)
+    need = photos_bytes(sizes, source.downscale, channels)
+    if need > limit:
+        factors = range(source.downscale + 1, min(MAX_DOWNSCALE, *map(min, sizes)) + 1)
+        fit = next((k for k in factors if photos_bytes(sizes, k, channels) <= limit), None)
+        advice = "use fewer photos"
+        if fit is not None:
+            advice = f"use downscale={fit} ({photos_bytes(sizes, fit, channels) / GIB:.1f} GiB)"
+            folders = sorted(f.name for f in path.glob("images_*") if f.is_dir() and f.name != source.images)
+            advice += f" or a folder of smaller images ({', '.join(folders)})" if folders else ""
+        width, height = max(sizes)
+        raise ValueError(
+            f"{path}: {len(sizes)} photos of up to {width}x{height} at downscale={source.downscale} need "
+            f"{need / GIB:.1f} GiB of host memory, of which {free / GIB:.1f} GiB are free; {advice}"
+        )
     largest = max(
         READ_BYTES * job.size[0] * job.size[1]
         + (UNDISTORT_BYTES * job.target.width * job.target.height if job.photo.lens.distorted else 0)
         for job in jobs
     )
-    return max(1, min(MAX_READERS, (os.cpu_count() or 1) + 4, free // (2 * largest)))
+    return max(1, min(MAX_READERS, (os.cpu_count() or 1) + 4, (free - need) // (2 * largest)))
 
 
 def _map(

@@ -4,6 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -22,14 +23,17 @@ from nexwarp.data.images import (
     read_transparent,
     resize_mask,
 )
-from nexwarp.data.lens import FACES, PANORAMA, Intrinsics, Lens, Maps
+from nexwarp.data.lens import FACES, PANORAMA, Intrinsics, Lens, undistortion
 from nexwarp.io.files import one_line
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 OPAQUE = 255
 # A larger side than this ratio times the camera's is refused before decoding, since tiny files can hold huge images.
 MAX_ENLARGED, SMALL = 16, 1024
+KEPT_MAPS = 6  # for the faces of a panorama
 HALF = 128  # smallest alpha of a used pixel, with alpha as the mask
+
+undistorted = lru_cache(maxsize=4096)(Lens.undistorted)
 
 
 @dataclass(frozen=True)
@@ -100,7 +104,7 @@ class ViewReader:
 
     def __init__(self, downscale: int, background: tuple[float, float, float] | None, alpha_mask: bool) -> None:
         self.downscale, self.background, self.alpha_mask = downscale, background, alpha_mask
-        self.maps = Maps()
+        self._maps, self._lock = lru_cache(KEPT_MAPS)(undistortion), Lock()
 
     def plan(self, photo: Photo) -> list[PlannedView]:
         """Read the header of a photo and check it against its lens; return one view, or six for a panorama.
@@ -122,7 +126,7 @@ class ViewReader:
         if photo.mask is not None and not self.alpha_mask:
             _check_mask(photo, photo.mask, size)
         try:
-            target = _undistorted_intrinsics(lens)
+            target = undistorted(lens)
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"{photo.file}: the camera of this image is not usable: {one_line(error)}") from error
         ratio = width / lens.width, height / lens.height
@@ -150,11 +154,12 @@ class ViewReader:
             mask = None
         if mask is not None and not mask.any():
             raise ValueError(f"{photo.mask or photo.file}: expected a mask with pixels that count, got none")
-        K = plan.target.K.copy()
+        target = plan.target
+        K = torch.tensor([[target.fx, 0, target.cx], [0, target.fy, target.cy], [0, 0, 1]], dtype=torch.float64)
         K[:2] /= self.downscale
         try:
             viewmat = torch.from_numpy(photo.viewmat).float()
-            camera = Camera(viewmat, torch.from_numpy(K).float(), image.shape[1], image.shape[0], near, origin=origin)
+            camera = Camera(viewmat, K.float(), image.shape[1], image.shape[0], near, origin=origin)
         except ValueError as error:
             raise ValueError(f"{photo.file}: the camera of this image is not usable: {error}") from error
         points = None if photo.points is None else torch.from_numpy(photo.points)
@@ -173,18 +178,14 @@ class ViewReader:
         elif alpha is not None:
             image = compose(image, alpha, self.background)
         if photo.lens.distorted:
-            undistort = self.maps.get(photo.lens, plan.target, photo.face)
+            with self._lock:  # photos that share a lens wait for its map
+                undistort = self._maps(photo.lens, plan.target, photo.face)
             image, mask = undistort.colors(image), undistort.mask(mask)
             alpha = undistort.colors(alpha[:, :, None])[:, :, 0] if alpha is not None else None
         image = downscale_image(image, self.downscale)
         mask = downscale_mask(mask, self.downscale) if mask is not None else None
         alpha = downscale_image(alpha[:, :, None], self.downscale)[:, :, 0] if alpha is not None else None
         return image, alpha, mask
-
-
-@lru_cache(maxsize=4096)
-def _undistorted_intrinsics(lens: Lens) -> Intrinsics:
-    return lens.undistorted()
 
 
 def _face(photo: Photo, face: str) -> Photo:

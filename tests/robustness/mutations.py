@@ -63,7 +63,7 @@ MUTATIONS = [
     Mutation(KERNELS + "tiles.py", "wp.constant(wp.float64(0.999))", "wp.constant(wp.float64(1.5))", AGREE),
     # 29: data and cameras
     Mutation("data/lens.py", "+ p2 * (r + 2 * x * x)", "+ p2 * (r + x * x)", "tests/data/test_lens.py tests/data/inputs/test_lenses.py"),
-    Mutation("data/lens.py", "K[1] *= height / self.height", "K[1] *= width / self.width", "tests/data/test_scene.py"),
+    Mutation("data/lens.py", "width / self.width, height / self.height", "width / self.width, width / self.width", "tests/data/test_scene.py"),
     Mutation("data/colmap.py", "2 * (x * y - w * z), 2 * (x * z + w * y)),", "2 * (x * y + w * z), 2 * (x * z + w * y)),", "tests/data/test_scene.py"),
     Mutation("data/colmap.py", "models[0] if len(models) == 1 else max(", "models[0] if models else max(", "tests/data"),
     Mutation("data/images.py", "WHITE = 128", "WHITE = 200", "tests/data/inputs/test_masks.py"),

@@ -17,7 +17,7 @@ import numpy as np
 from nexwarp.data.capture import safe_name, short
 from nexwarp.data.images import downscale_image, image_size, read_image
 from nexwarp.data.lens import pycolmap_module
-from nexwarp.data.memory import GIB, SHARE
+from nexwarp.data.scene import GIB, SHARE
 from nexwarp.data.sfm.frames import BLURRED, SIDE, STILL, THUMBNAIL, motion, reduced_luma, sharpness
 from nexwarp.data.sfm.options import SfmOptions
 from nexwarp.errors import OutOfMemoryError

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from nexwarp.data import load_scene
-from nexwarp.data.lens import Intrinsics, Lens, Maps
+from nexwarp.data.lens import Intrinsics, Lens, undistortion
 from tests.data.inputs import room
 from tests.data.inputs.support import assert_same_cameras
 from tests.data.test_scene import make_scene
@@ -149,8 +149,8 @@ def test_a_wide_fisheye_keeps_its_view(tmp_path, degrees):
 def test_a_lens_that_turns_back_is_masked_from_there(tmp_path):
     """r - 0.5 r^3 turns back at r = 0.82: what lies beyond would show the inner part again."""
     lens = Lens("OPENCV", (40.0, 40.0, *CENTRE, -0.5, 0.0, 0.0, 0.0), room.WIDTH, room.HEIGHT)
-    wide = Intrinsics(np.array([[20.0, 0, 40.0], [0, 20.0, 30.0], [0, 0, 1]]), 80, 60)
-    valid = Maps().get(lens, wide, None).valid
+    wide = Intrinsics(20.0, 20.0, 40.0, 30.0, 80, 60)
+    valid = undistortion(lens, wide, None).valid
     assert valid is not None
     radius = np.linalg.norm(room.pinhole_rays((20.0, 20.0, 40.0, 30.0), 80, 60)[..., :2], axis=-1)
     turn = np.sqrt(2 / 3)

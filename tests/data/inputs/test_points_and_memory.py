@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-import nexwarp.data.memory
 import nexwarp.data.scene
 import nexwarp.data.views
 import nexwarp.machine
@@ -47,22 +46,22 @@ def test_photos_that_do_not_fit_are_refused_before_they_are_read(tmp_path, monke
     path = make_scene(tmp_path / "scene")
     (path / "images_2").mkdir()
     need = 10 * 48 * 36 * 3
-    monkeypatch.setattr(nexwarp.data.memory, "available_memory", lambda: need // 3)
+    monkeypatch.setattr(nexwarp.data.scene, "available_memory", lambda: need // 3)
     monkeypatch.setattr(nexwarp.data.views, "read_image", lambda *_: pytest.fail("read"))
     with pytest.raises(ValueError, match=r"10 photos of up to 48x36 .* use downscale=2 \(.*\) or .* \(images_2\)") as e:
         load_scene(path)
     assert "\n" not in str(e.value)
-    monkeypatch.setattr(nexwarp.data.memory, "available_memory", lambda: 0)
+    monkeypatch.setattr(nexwarp.data.scene, "available_memory", lambda: 0)
     with pytest.raises(ValueError, match="use fewer photos"):
         load_scene(path)
     monkeypatch.undo()
-    monkeypatch.setattr(nexwarp.data.memory, "available_memory", lambda: need // 3)
+    monkeypatch.setattr(nexwarp.data.scene, "available_memory", lambda: need // 3)
     load_scene(path, downscale=2)
 
 
 def test_a_thousand_photos_of_eight_megapixels_fit_8_gb_at_half_size():
     sizes = [(3264, 2448)] * 1000
-    assert nexwarp.data.memory.photos_bytes(sizes, 2, 3) < 0.9 * 7.2e9 < nexwarp.data.memory.photos_bytes(sizes, 1, 3)
+    assert nexwarp.data.scene.photos_bytes(sizes, 2, 3) < 0.9 * 7.2e9 < nexwarp.data.scene.photos_bytes(sizes, 1, 3)
     assert nexwarp.machine.available_memory() > 2**20
 
 
