@@ -20,7 +20,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,11 +37,13 @@ from nexwarp.train.checkpoint import _read_checkpoint
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from tests.scene_writers import write_demo
 
+# Nothing is written while exposures are estimated, SH smoothed and detail limits found, which would take most of such a
+# short command.
 SMALL = Config(
     exposures=False,
     smooth_sh=0.0,
     footprints=False,
-    texture=TextureConfig(levels=2, table_size=2**10, width=8),
+    texture=TextureConfig(levels=2, table_size=2**6, width=8),
     densify=DensifyConfig(every=2),
     sh_degree=1,
 )
@@ -55,14 +57,10 @@ FOREIGN = ("notes.txt", "run/notes.txt", "run/renders/mine.png", "run/export/min
 
 @dataclass(frozen=True)
 class Base:
-    """What all breakdowns share: a folder, the disk in it, a scene and a finished run."""
+    """What all breakdowns share: a folder, the disk that is mounted in it, a scene and a finished run."""
 
     folder: Path
-
-    @property
-    def disk(self) -> Path:
-        """Where the disk is mounted."""
-        return self.folder / "disk"
+    disk: Path
 
     def words(self, command: str, chance: random.Random) -> list[str]:
         """Return a command line."""
@@ -121,37 +119,30 @@ def started(base: Base, words: list[str]) -> int:
 def ended(child: int) -> int:
     """Wait for a process, end what it has left running, and return its exit code."""
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    try:
+    with suppress(ProcessLookupError):
         os.killpg(child, signal.SIGKILL)
-    except ProcessLookupError:
-        pass
     return code
 
 
 def files(folder: Path) -> dict[str, bytes]:
     """Return the files below a folder."""
-    return {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
 
 
-def whole(file: Path, known: dict[str, bytes], name: str) -> bool:
-    """Whether a file is complete: it can be read, or is one that is known."""
+def whole(file: Path) -> bool:
+    """Whether a file can be read; True for one of a kind that nexwarp does not read."""
     readers: dict[str, Callable[[Path], object]] = {
         ".json": lambda path: json.loads(path.read_bytes()),
         ".png": lambda path: Image.open(path).load(),
         ".jpg": lambda path: Image.open(path).load(),
         ".exr": load_exr,
+        ".safetensors": lambda path: nw.load(path) if path.stem != "tensors" else _read_checkpoint(path.parent),
     }
     try:
-        if file.name == "tensors.safetensors":
-            return bool(_read_checkpoint(file.parent))
-        if file.suffix == ".safetensors":
-            return bool(nw.load(file))
-        if file.suffix in readers:
-            readers[file.suffix](file)
-            return True
+        readers.get(file.suffix, str)(file)
     except (OSError, ValueError, RuntimeError, SyntaxError):
         return False
-    return name not in known or file.read_bytes() == known[name] or file.name in ("metrics.jsonl", "run.lock")
+    return True
 
 
 @dataclass(frozen=True)
@@ -214,8 +205,11 @@ def faults(base: Base, words: list[str], normal: Measured, kind: str, share: flo
         if code != 0:
             yield f"once more: exit code {code}, {(base.folder / 'err').read_text()!r}"
         yield from damage(base, before, normal, killed=True)
-        if missing := normal.files.keys() - files(base.disk).keys() - {"run2/checkpoint.old"}:
+        now = files(base.disk)
+        if missing := normal.files.keys() - now.keys() - {"run2/checkpoint.old"}:
             yield f"once more: {sorted(missing)[:3]} are missing"
+        if now.get("run2/model.safetensors") != normal.files.get("run2/model.safetensors"):
+            yield "once more: another model"
     finally:
         base.unmount()
 
@@ -232,7 +226,7 @@ def damage(base: Base, before: dict[str, bytes], normal: Measured, *, killed: bo
                 yield f"{name}: left behind"
         elif name not in normal.files and "checkpoint" not in name and not (killed and name.endswith("run.lock")):
             yield f"{name}: not a file of a complete command"
-        elif not whole(base.disk / name, normal.files if name.startswith("run/export") else {}, name):
+        elif not whole(base.disk / name) or (name.startswith("run/export") and now[name] != normal.files[name]):
             yield f"{name}: half-written"
 
 
@@ -241,7 +235,8 @@ def prepared() -> Iterator[Base]:
     """Make the scene and the finished run, with small settings."""
     preset = recipe.PRESETS["default"]
     recipe.PRESETS["default"] = SMALL
-    base = Base(Path(tempfile.mkdtemp(prefix="nexwarp-breakdowns-")))
+    folder = Path(tempfile.mkdtemp(prefix="nexwarp-breakdowns-"))
+    base = Base(folder, folder / "disk")
     try:
         base.disk.mkdir()
         write_demo(base.folder / "scene", width=24, height=18, views=6, points=100)

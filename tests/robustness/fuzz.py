@@ -8,25 +8,25 @@ saved. The same seed gives the same inputs.
 """
 
 import argparse
+import contextlib
 import ctypes
 import multiprocessing
 import os
 import random
 import resource
 import shutil
+import signal
 import sys
 import tempfile
 import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
-import psutil
 import warp as wp
 
 from nexwarp.kernels import launch
@@ -39,7 +39,14 @@ MEMORY = 10**9  # bytes that the process may have beyond those before its first 
 BATCH = 2000  # inputs a process
 DOCUMENTED = (ValueError, TypeError, FileNotFoundError)
 M_ARENA_MAX = -8  # of glibc's mallopt: an arena a thread would count as 64 MB of address space
-NO_MEMORY = ("can't allocate", "bad_alloc", "not enough memory", "Unable to allocate", "std::length_error")
+NO_MEMORY = (
+    "MemoryError",
+    "can't allocate",
+    "bad_alloc",
+    "not enough memory",
+    "Unable to allocate",
+    "std::length_error",
+)
 
 
 @dataclass(frozen=True)
@@ -48,7 +55,6 @@ class Failure:
 
     kind: str
     detail: str
-    index: int = 0
     folder: Path | None = None
 
 
@@ -57,8 +63,7 @@ class Result:
     """Outcomes of a target's inputs: those that did not load were refused with a documented exception, or failed."""
 
     inputs: int = 0
-    loaded: int = 0
-    refusals: Counter[str] = field(default_factory=Counter)
+    outcomes: Counter[str] = field(default_factory=Counter)  # "loaded", or the name of an exception
     failures: list[Failure] = field(default_factory=list)
 
 
@@ -71,7 +76,12 @@ def judge(read: Callable[[Path], object], folder: Path) -> str | Failure:
             read(folder)
     except Exception as error:
         text = "".join(traceback.format_exception(error))
-        if any(isinstance(e, MemoryError) or any(word in str(e) for word in NO_MEMORY) for e in _causes(error)):
+        reasons: list[str] = []
+        link: BaseException | None = error
+        while link is not None:
+            reasons.append(repr(link))
+            link = link.__cause__ or link.__context__
+        if any(word in reason for word in NO_MEMORY for reason in reasons):
             return Failure("memory", text)
         if not isinstance(error, DOCUMENTED) and not (isinstance(error, OSError) and str(folder) in str(error)):
             return Failure(type(error).__name__, text)
@@ -80,15 +90,6 @@ def judge(read: Callable[[Path], object], folder: Path) -> str | Failure:
             return Failure("message", text)
         return type(error).__name__
     return "loaded"
-
-
-def _causes(error: BaseException) -> list[BaseException]:
-    chain: list[BaseException] = []
-    link: BaseException | None = error
-    while link is not None and link not in chain:
-        chain.append(link)
-        link = link.__cause__ or link.__context__
-    return chain
 
 
 @dataclass(frozen=True)
@@ -101,81 +102,54 @@ class Campaign:
 
     def run(self, *, seconds: float, inputs: int) -> Result:
         """Run until time or inputs are used up."""
-        result, index, end = Result(), 0, time.monotonic() + seconds
+        result, end = Result(), time.monotonic() + seconds
+        context = multiprocessing.get_context("fork")
         with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as scratch:
             valid = self.target.make(Path(scratch) / "valid")
             folder = Path(scratch) / "input"
-            while index < inputs and time.monotonic() < end:
-                index = self._batch(valid, folder, result, range(index, min(index + BATCH, inputs)), end)
+            while result.inputs < inputs and time.monotonic() < end:
+                indices = range(result.inputs, min(result.inputs + BATCH, inputs))
+                ours, theirs = context.Pipe(duplex=False)
+                process = context.Process(target=self._work, args=(valid, folder, theirs, indices, end), daemon=True)
+                process.start()
+                theirs.close()
+                with contextlib.suppress(EOFError, OSError):  # it has ended
+                    while True:
+                        self._count(ours.recv(), result)
+                process.join()
+                if (code := process.exitcode) != 0:
+                    hung = code in (-signal.SIGPROF, -signal.SIGALRM)
+                    kind, detail = ("hang", f"longer than {HANG:g} s") if hung else ("crash", f"exit code {code}")
+                    self._count(self._saved(Failure(kind, detail), result.inputs, folder), result)
         return result
 
-    def _batch(self, valid: list[Files], folder: Path, result: Result, indices: range, end: float) -> int:
-        """Run inputs in one forked process, and return the index to continue with."""
-        context = multiprocessing.get_context("fork")
-        ours, theirs = context.Pipe(duplex=False)
-        now = context.RawArray("d", [float(indices.start), time.monotonic(), 0.0])
-        process = context.Process(target=self._work, args=(valid, folder, theirs, now, indices, end), daemon=True)
-        process.start()
-        theirs.close()
-        hung = False
-        while True:
-            try:
-                if hung or ours.poll(0.1):
-                    self._collect(ours.recv(), result)
-            except EOFError:
-                break
-            if not hung and _hangs(process.pid, now):
-                hung = True
-                process.kill()
-        process.join()
-        index = int(now[0])
-        if process.exitcode == 0:
-            return index
-        detail = f"longer than {HANG:g} s" if hung else f"exit code {process.exitcode}"
-        failure = Failure("hang" if hung else "crash", detail, index)
+    def _count(self, outcome: str | Failure, result: Result) -> None:
         result.inputs += 1
-        result.failures.append(self._saved(failure, folder))
-        return index + 1
+        if isinstance(outcome, Failure):
+            result.failures.append(outcome)
+        else:
+            result.outcomes[outcome] += 1
 
-    def _collect(self, message: tuple[Any, ...], result: Result) -> None:
-        if isinstance(message[0], Failure):
-            failure, folder = message
-            result.failures.append(self._saved(failure, folder))
-            shutil.rmtree(folder, ignore_errors=True)
-            return
-        inputs, loaded, refusals = message
-        result.inputs += inputs
-        result.loaded += loaded
-        result.refusals += refusals
-
-    def _saved(self, failure: Failure, folder: Path) -> Failure:
-        kept = self.failed / f"{self.target.name}-{failure.index}-{failure.kind}"
-        kept.parent.mkdir(parents=True, exist_ok=True)
+    def _saved(self, failure: Failure, index: int, folder: Path) -> Failure:
+        kept = self.failed / f"{self.target.name}-{index}-{failure.kind}"
         shutil.rmtree(kept, ignore_errors=True)
         if folder.is_dir():
             shutil.copytree(folder, kept, symlinks=True)
-        else:
-            kept.mkdir()
+        kept.mkdir(parents=True, exist_ok=True)
         (kept / "failure.txt").write_text(failure.detail, encoding="utf-8", errors="backslashreplace")
         return replace(failure, folder=kept)
 
-    def _work(self, valid: list[Files], folder: Path, report: Connection, now: Any, indices: range, end: float) -> None:
+    def _work(self, valid: list[Files], folder: Path, report: Connection, indices: range, end: float) -> None:
         """Body of the forked process; its reports count only inputs that ended."""
         _confine()
         for index in indices:
             rng = random.Random(f"{self.seed}/{self.target.name}/{index}")
             self.target.write(folder, damage(rng, rng.choice(valid), self.target.fuzzed))
-            now[:] = [float(index), time.monotonic(), time.process_time()]
+            # Unless the input ends in time, a signal ends the process.
+            signal.setitimer(signal.ITIMER_PROF, HANG)
+            signal.setitimer(signal.ITIMER_REAL, ASLEEP * HANG)
             outcome = judge(self.target.read, folder)
-            if isinstance(outcome, Failure):
-                kept = folder.with_name(f"failed-{index}")
-                shutil.copytree(folder, kept, symlinks=True)
-                report.send((replace(outcome, index=index), kept))
-                report.send((1, 0, Counter()))
-            else:
-                loaded = outcome == "loaded"
-                report.send((1, int(loaded), Counter() if loaded else Counter([outcome])))
-            now[:] = [float(index + 1), time.monotonic(), time.process_time()]
+            report.send(self._saved(outcome, index, folder) if isinstance(outcome, Failure) else outcome)
             if time.monotonic() > end:
                 break
         report.close()
@@ -183,20 +157,10 @@ class Campaign:
         os._exit(0)
 
 
-def _hangs(process: int | None, now: Sequence[float]) -> bool:
-    """Whether a process works for too long on an input, begun at the times now[1:], monotonic and of the process."""
-    seconds = time.monotonic() - now[1]
-    if seconds <= HANG or process is None:
-        return False
-    try:
-        used = sum(psutil.Process(process).cpu_times()[:2])
-    except psutil.Error:  # it has ended
-        return False
-    return used - now[2] > HANG or seconds > ASLEEP * HANG
-
-
 def _confine() -> None:
-    """Print nothing, and take little memory."""
+    """Print nothing, take little memory, and die of signals."""
+    for number in (signal.SIGPROF, signal.SIGALRM):
+        signal.signal(number, signal.SIG_DFL)
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
     os.dup2(null, 2)
@@ -224,9 +188,8 @@ def main(arguments: list[str] | None = None) -> int:
         seconds = (end - time.monotonic()) / (len(options.targets) - place)
         result = Campaign(TARGETS[name], options.seed, options.failed).run(seconds=seconds, inputs=options.inputs)
         total, failures = total + result.inputs, failures + len(result.failures)
-        refused = ", ".join(f"{count:,} {kind}" for kind, count in result.refusals.most_common())
-        figures = f"{result.inputs:>9,} inputs {result.loaded:>9,} loaded {len(result.failures):>4} failures"
-        print(f"{name:18} {figures}  ({refused})", flush=True)
+        outcomes = ", ".join(f"{count:,} {kind}" for kind, count in result.outcomes.most_common())
+        print(f"{name:18} {result.inputs:>9,} inputs {len(result.failures):>4} failures  ({outcomes})", flush=True)
         for failure in result.failures[:10]:
             print(f"    {failure.kind} at {failure.folder}: {failure.detail.strip().splitlines()[-1][:200]!a}")
     print(f"{total:,} inputs, {failures} failures, in {options.seconds:.0f} s")

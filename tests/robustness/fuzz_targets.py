@@ -6,6 +6,8 @@ import functools
 import hashlib
 import json
 import os
+import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,33 +16,41 @@ import numpy as np
 import torch
 from PIL import Image
 
+from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.data import load_scene
 from nexwarp.data.images import read_image, read_mask, read_transparent
-from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.ply import read_ply
 from nexwarp.data.scene import SceneSource
 from nexwarp.data.sfm.photos import MAKE, MODEL, camera_groups, read_photos
 from nexwarp.export.surfels_ply import save_splats_ply
 from nexwarp.io.json_files import write_json
 from nexwarp.io.pictures import load_exr, save_exr
+from nexwarp.model.detail_limits import DetailLimits
+from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
-from nexwarp.train.recipe import Config
+from nexwarp.train.recipe import Config, TextureConfig
+from nexwarp.train.trainer import Trainer
+from tests.model_file_support import make_model
 from tests.robustness.fuzz_inputs import Files
-from tests.robustness.fuzz_models import (
-    HEIGHT,
-    VIEWS,
-    WIDTH,
-    check_rendering,
-    some_cameras,
-    some_model,
-    some_surfels,
-    some_trainer,
-    some_viewmats,
+from tests.scene_writers import (
+    BARREL,
+    FISHEYE,
+    demo_lens,
+    write_blender,
+    write_demo,
+    write_distorted,
+    write_nerfstudio,
+    write_points,
+    write_text,
 )
+from tests.scenes import make_camera, make_surfels, random_scene
+
+WIDTH, HEIGHT, VIEWS = 12, 9, 3
+TEXTURE = TextureConfig(levels=2, table_size=16, width=8, hidden_layers=1)
 
 
 @dataclass(frozen=True)
@@ -72,128 +82,101 @@ def _noise(*channels: int, most: int = 256, dtype: type = np.uint8) -> Image.Ima
     return Image.fromarray(np.random.default_rng(0).integers(0, most, (HEIGHT, WIDTH, *channels), dtype=dtype))
 
 
-def _photos(folder: Path, mode: str = "RGB") -> list[str]:
-    folder.mkdir(parents=True, exist_ok=True)
-    names = [f"{index}.png" for index in range(VIEWS)]
-    for name in names:
-        _noise(len(mode)).save(folder / name)
-    return names
+def _scene(folder: Path) -> Path:
+    """A scene of three photos."""
+    return write_demo(folder, WIDTH, HEIGHT, VIEWS, points=6)
+
+
+def _cameras(folder: Path) -> dict[str, Camera]:
+    scene = load_scene(_scene(folder))
+    return {view.name: view.camera for view in (*scene.train, *scene.test)}
 
 
 def _colmap(text: bool) -> Callable[[Path], list[Files]]:
     def make(folder: Path) -> list[Files]:
-        pycolmap = pycolmap_module()
-        models = {
-            "PINHOLE": [10.0, 11.0, 6.0, 4.5],
-            "SIMPLE_RADIAL": [10.0, 6.0, 4.5, 0.05],
-            "OPENCV_FISHEYE": [10.0, 11.0, 6.0, 4.5, 0.01, 0.0, 0.0, 0.0],
-        }
-        inputs = []
-        for model, params in models.items():
-            path = folder / model
-            names = _photos(path / "images")
-            scene = pycolmap.Reconstruction()
-            camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params, camera_id=1)
-            scene.add_camera_with_trivial_rig(camera)
-            for index, (name, viewmat) in enumerate(zip(names, some_viewmats(), strict=True)):
-                image = pycolmap.Image(name=name, keypoints=np.ones((6, 2)), camera_id=1, image_id=index + 1)
-                scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(viewmat[:3]))
-            for index in range(6):
-                track = pycolmap.Track()
-                for image_id in range(1, 2 + index % 3):
-                    track.add_element(image_id, index)
-                scene.add_point3D(0.1 * np.array([index, index % 2, 1.0]), track, np.array([9, 99, 200], np.uint8))
-            (path / "sparse/0").mkdir(parents=True)
-            (scene.write_text if text else scene.write_binary)(str(path / "sparse/0"))
-            inputs.append(_files(path))
-        return inputs
+        scenes = [_scene(folder / "pinhole")]
+        for model, coefficients in (("OPENCV", BARREL), ("OPENCV_FISHEYE", FISHEYE)):
+            scenes.append(write_distorted(scenes[0], folder / model, demo_lens(scenes[0], model, coefficients)))
+        if text:
+            scenes = [write_text(scene, folder / f"{scene.name} text") for scene in scenes]
+        return [_files(scene) for scene in scenes]
 
     return make
 
 
 def _ply(folder: Path) -> list[Files]:
-    folder.mkdir(parents=True, exist_ok=True)
-    rows = [(0.1 * i, 0.2 * i, 1.0, 10 * i, 20, 30) for i in range(6)]
-    names = ("x", "y", "z", "red", "green", "blue")
-    kinds = {"ascii": ("float",) * 3 + ("uchar",) * 3, "binary_little_endian": ("float",) * 3 + ("uchar",) * 3,
-             "binary_big_endian": ("double",) * 3 + ("ushort",) * 3}  # fmt: skip
-    inputs = []
-    for form, types in kinds.items():
-        properties = [f"property {kind} {name}" for kind, name in zip(types, names, strict=True)]
-        header = ["ply", f"format {form} 1.0", "comment six points", "element camera 1", "property int id"]
-        header += ["element vertex 6", *properties, "element face 0", "property list uchar int vertex_index"]
-        head = "\n".join([*header, "end_header", ""]).encode()
-        if form == "ascii":
-            body = b"7\n" + b"".join(" ".join(map(str, row)).encode() + b"\n" for row in rows)
-        else:
-            order = "<" if "little" in form else ">"
-            codes = {"float": "f4", "double": "f8", "uchar": "u1", "ushort": "u2"}
-            dtype = np.dtype([(name, order + codes[kind]) for name, kind in zip(names, types, strict=True)])
-            body = np.array([7], f"{order}i4").tobytes() + np.array(rows, dtype).tobytes()
-        inputs.append({"points.ply": head + body})
-    save_splats_ply(folder / "points.ply", some_surfels())
-    return [*inputs, _files(folder)]
+    folder.mkdir(parents=True)
+    numbers = np.arange(18.0).reshape(6, 3)
+    for form in ("ascii", "binary_little_endian", "binary_big_endian"):
+        write_points(folder / form, 0.1 * numbers, numbers.astype(np.uint8), form)
+    save_splats_ply(folder / "splats", make_surfels(random_scene(5)))
+    return [{"points.ply": data} for data in _files(folder).values()]
 
 
 def _nerfstudio(folder: Path) -> list[Files]:
-    cameras = some_cameras()
-    inputs = []
-    for kind in ("plain", "full", "fisheye"):
-        path = folder / kind
-        names = [f"images/{name}" for name in _photos(path / "images", "RGBA")]
-        _photos(path / "masks")
-        save_transforms(path / "transforms.json", dict(zip(names, cameras, strict=True)))
-        data = json.loads((path / "transforms.json").read_text())
-        if kind == "fisheye":
-            data |= {"camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k2": 0.0, "k3": 0.0, "k4": 0.0}
-        if kind == "full":
-            data |= {"camera_model": "OPENCV", "k1": 0.01, "p1": 0.001, "ply_file_path": "points.ply"}
-            data |= {"applied_transform": np.eye(4)[[0, 2, 1]].tolist(), "applied_scale": 0.5}
-            data["applied_transform"][1] = [0.0, 0.0, -1.0, 0.5]
-            data |= {"train_filenames": names[:2], "val_filenames": names[2:], "test_filenames": names[2:]}
-            for frame, name in zip(data["frames"], names, strict=True):
-                frame["mask_path"] = name.replace("images", "masks")
-            save_splats_ply(path / "points.ply", some_surfels())
-        (path / "transforms.json").write_text(json.dumps(data))
-        inputs.append(_files(path))
-    return inputs
+    scene = _scene(folder / "pinhole")
+    fisheye = write_distorted(scene, folder / "fisheye", demo_lens(scene, "OPENCV_FISHEYE", FISHEYE))
+    plain, full = write_nerfstudio(scene, folder / "plain"), write_nerfstudio(scene, folder / "full")
+    shutil.copytree(full / "images", full / "masks")
+    data = json.loads((full / "transforms.json").read_text())
+    names = [frame["file_path"] for frame in data["frames"]]
+    data |= {"k1": 0.01, "p1": 0.001, "applied_scale": 0.5}
+    data |= {"train_filenames": names[:2], "val_filenames": names[2:], "test_filenames": names[2:]}
+    for frame in data["frames"]:
+        frame["mask_path"] = frame["file_path"].replace("images", "masks")
+    (full / "transforms.json").write_text(json.dumps(data))
+    return [_files(plain), _files(full), _files(write_nerfstudio(fisheye, folder / "wide"))]
 
 
 def _blender(folder: Path) -> list[Files]:
-    save_transforms(folder / "all.json", {str(i): camera for i, camera in enumerate(some_cameras())})
-    frames = [frame["transform_matrix"] for frame in json.loads((folder / "all.json").read_text())["frames"]]
-    for split in ("train", "test"):
-        names = _photos(folder / split, "RGBA")
-        entries = [
-            {"file_path": f"./{split}/{name[:-4]}", "rotation": 0.01, "transform_matrix": matrix}
-            for name, matrix in zip(names, frames, strict=True)
-        ]
-        (folder / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": entries}))
-    (folder / "all.json").unlink()
-    return [_files(folder)]
+    return [_files(write_blender(_scene(folder / "colmap"), folder / "blender"))]
+
+
+def _some_model(folder: Path) -> Model:
+    """Return a model with every part that a file can hold."""
+    model = make_model(5)
+    model.exposures = Exposures.of(0.1 * torch.randn(VIEWS, 3), list(_cameras(folder).values()), (-0.3, -0.2, 0.4))
+    model.detail_limits = DetailLimits(torch.full((5,), 0.02), torch.full((5,), 0.2))
+    return model
 
 
 def _model(folder: Path) -> list[Files]:
-    full = some_model()
+    full = _some_model(folder / "scene")
     save_model(folder / "a", full)
-    save_model(folder / "b", Model(full.surfels, full.texture, options=full.options))
+    save_model(folder / "b", make_model(5))
     save_model(folder / "c", full, compact=True)
     _read_model(folder / "a")  # the first reading imports modules and kernels for seconds, which no input must pay for
     return [_files(folder / name) for name in "abc"]
 
 
 def _read_model(folder: Path) -> None:
-    check_rendering(load(folder))
+    _check_rendering(load(folder))
+
+
+@torch.no_grad()
+def _check_rendering(model: Model, camera: Camera | None = None) -> None:
+    """Raise AssertionError unless a picture of a few pixels is finite, from the camera or one that sees the surfels."""
+    out = model.render(dataclasses.replace(camera or make_camera(random_scene(5)), width=4, height=3))
+    for name in ("image", "alpha", "depths", "expected_depth", "normals"):
+        assert bool(torch.isfinite(getattr(out, name)).all()), f"{name} is not finite"
+
+
+@functools.cache  # it takes seconds
+def _trainer() -> Trainer:
+    """Return a trainer after two steps."""
+    with tempfile.TemporaryDirectory() as folder:
+        scene = load_scene(_scene(Path(folder) / "scene"))
+    config = Config(iterations=4, max_surfels=20, sh_degree=1, texture=TEXTURE)
+    trainer = Trainer(scene, config, "cpu")
+    trainer.run(until=2)
+    return trainer
 
 
 def _checkpoint(folder: Path) -> list[Files]:
     folder.mkdir(parents=True, exist_ok=True)
     _trainer().save(folder)
-    check_rendering(_trainer().model())
+    _check_rendering(_trainer().model())
     return [_files(folder)]
-
-
-_trainer = functools.cache(some_trainer)  # which takes seconds
 
 
 def _read_checkpoint(folder: Path) -> None:
@@ -209,7 +192,7 @@ def _read_checkpoint(folder: Path) -> None:
             state.write_text(json.dumps(record | {"sha256": digest}))
     restored = _trainer()
     restored.restore(folder)
-    check_rendering(restored.model())
+    _check_rendering(restored.model())
 
 
 def _metrics(folder: Path) -> list[Files]:
@@ -222,12 +205,12 @@ def _metrics(folder: Path) -> list[Files]:
 def _read_cameras(folder: Path) -> None:
     for members in load_cameras(folder / "cameras.json").values():
         for camera in members.values():
-            check_rendering(some_model(), camera)
+            _check_rendering(make_model(5), camera)
 
 
 def _read_camera_path(folder: Path) -> None:
     for camera in load_camera_path(folder / "path.json").cameras[:4]:
-        check_rendering(some_model(), camera)
+        _check_rendering(make_model(5), camera)
 
 
 def _config(folder: Path) -> list[Files]:
@@ -236,20 +219,16 @@ def _config(folder: Path) -> list[Files]:
 
 
 def _run_cameras(folder: Path) -> list[Files]:
-    cameras = {str(i): camera for i, camera in enumerate(some_cameras())}
+    cameras = _cameras(folder / "scene")
     save_cameras(folder / "cameras.json", {"train": cameras, "test": cameras})
-    return [_files(folder)]
+    return [{"cameras.json": (folder / "cameras.json").read_bytes()}]
 
 
 def _camera_path(folder: Path) -> list[Files]:
-    cameras = some_cameras()
-    save_camera_path(folder / "a" / "path.json", cameras)
-    plain = [
-        dataclasses.replace(c, K=torch.tensor([[11.0, 0.0, 6.0], [0.0, 11.0, 4.5], [0.0, 0.0, 1.0]])) for c in cameras
-    ]
-    save_camera_path(folder / "b" / "path.json", plain)
-    save_transforms(folder / "c" / "path.json", {str(i): camera for i, camera in enumerate(cameras)})
-    return [_files(folder / name) for name in "abc"]
+    cameras = _cameras(folder / "scene")
+    save_camera_path(folder / "a" / "path.json", list(cameras.values()))
+    save_transforms(folder / "b" / "path.json", cameras)
+    return [_files(folder / name) for name in "ab"]
 
 
 def _images(folder: Path) -> list[Files]:

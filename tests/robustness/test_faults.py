@@ -1,33 +1,24 @@
 """A disk that is full or fails, at every single write: one clear line, nothing lost that was saved, nothing half."""
 
 import errno
-import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 import nexwarp as nw
 from nexwarp.cli import main as cli
-from nexwarp.io.pictures import load_exr
 from nexwarp.train.checkpoint import _read_checkpoint
-from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from tests.faults import Disk, failing
+from tests.robustness.breakdowns import SMALL, files, sweep, whole
 from tests.scene_writers import write_demo
 
 pytestmark = pytest.mark.usefixtures("small_preset")
+__all__ = ["SMALL"]  # the preset of `small_preset`
 
-# Nothing is written while exposures are estimated, SH smoothed and detail limits found, which would take most of such a
-# short command.
-SMALL = Config(
-    exposures=False,
-    smooth_sh=0.0,
-    footprints=False,
-    texture=TextureConfig(levels=2, table_size=2**6, width=8),
-    densify=DensifyConfig(every=2),
-    sh_degree=1,
-)
 FLAGS = ["--iterations", "2", "--max-surfels", "24", "--device", "cpu", "--checkpoint-every", "1"]
 FULL, BROKEN = errno.ENOSPC, errno.EIO
 
@@ -44,10 +35,6 @@ def trained(scene, tmp_path_factory) -> Path:
     return run
 
 
-def files(folder: Path) -> dict[str, bytes]:
-    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
-
-
 def whole_checkpoints(run: Path) -> list[int]:
     """Iterations of the checkpoints that are there; none may be damaged."""
     folders = [run / name for name in ("checkpoint", "checkpoint.old", "checkpoint.older")]
@@ -56,15 +43,7 @@ def whole_checkpoints(run: Path) -> list[int]:
 
 def check_whole(folder: Path) -> None:
     """Fail if any file below a folder is half-written, or a temporary one."""
-    for name in files(folder):
-        file = folder / name
-        assert ".tmp" not in name, name
-        if file.suffix == ".json":
-            json.loads(file.read_bytes())
-        elif file.name == "model.safetensors":
-            nw.load(file)
-        elif file.suffix == ".exr":
-            load_exr(file)
+    assert all(whole(folder / name) and ".tmp" not in name for name in files(folder))
     whole_checkpoints(folder)
 
 
@@ -167,3 +146,16 @@ def test_other_commands_survive_every_fault(trained, tmp_path, capsys, arguments
         now = files(run)
         assert before.keys() <= now.keys() <= after.keys()
         assert all(now[name] in (before.get(name), after[name]) for name in now)
+
+
+# A few of the breakdowns of breakdowns.py
+
+
+@pytest.mark.skipif(sys.platform != "linux" or os.geteuid() != 0, reason="mounting a disk needs Linux and root")
+@pytest.mark.timeout(600)
+def test_a_full_disk_or_a_kill_leaves_nothing_half_written():
+    try:
+        wrong = sweep(6, ["train", "render", "export"], seed=0)
+    except subprocess.CalledProcessError:
+        pytest.skip("this system refuses to mount a disk")
+    assert wrong == []

@@ -17,7 +17,7 @@ from nexwarp.machine import deterministic
 from nexwarp.model.buffers import PASSES, render_buffers
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
-from tests.faults import Allocator, allocating, failing_gpu
+from tests.faults import failing_gpu
 from tests.narrowing import present
 from tests.render_support import BACKGROUND, assert_same, loss
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
@@ -64,13 +64,13 @@ def test_a_rendering_or_gradient_that_lacks_memory_can_be_repeated(device):
         return [*(getattr(buffers, name) for name in PASSES), *grads]
 
     expected = results()  # compiles, and fills the caches
-    with allocating(Allocator()) as counted:
+    with failing_gpu() as counted:
         results()
-    assert counted.requests > 20
-    for fatal in chosen(counted.requests, device):
+    assert len(counted.requests) > 20
+    for fatal in chosen(len(counted.requests), device):
         with (
             pytest.raises((OutOfMemoryError, torch.OutOfMemoryError), match=r"2\.00 GiB"),
-            allocating(Allocator(fatal)),
+            failing_gpu(fatal),
         ):
             results()
         assert all(torch.equal(a, b) for a, b in zip(results(), expected, strict=True)), fatal
@@ -84,13 +84,13 @@ def test_a_training_that_lacks_memory_goes_on_from_its_last_good_state(tiny_scen
     config = small(deterministic=True)
     expected, run = Trainer(tiny_scene, config, device), Trainer(tiny_scene, config, device)
     start = run.snapshot()
-    with allocating(Allocator()) as counted:
+    with failing_gpu() as counted:
         expected.run(until=STEPS)
     failed = 0
-    for fatal in chosen(counted.requests, device):
+    for fatal in chosen(len(counted.requests), device):
         run.load_snapshot(start)
         try:
-            with allocating(Allocator(fatal)):
+            with failing_gpu(fatal):
                 run.run(until=STEPS)
         except OutOfMemoryError as error:
             assert f"at iteration {run.iteration}: it needed 2.00 GiB" in str(error) and "\n" not in str(error)
@@ -170,10 +170,12 @@ def train(scene: Path, run: Path, device: torch.device, *flags: str) -> int:
 
 def test_a_fault_of_the_gpu_stops_training_and_the_last_checkpoint_is_resumed(tiny_folder, tmp_path, capsys, device):
     whole = tmp_path / "whole"
-    with failing_gpu(None, "") as launches:
+    with failing_gpu(None, "") as counted:
         assert train(tiny_folder, whole, device) == 0
     expected = (whole / "model.safetensors").read_bytes()
-    places = random.Random(1).sample(range(len(launches) // 10, len(launches)), 12 if device.type == "cuda" else 3)
+    places = random.Random(1).sample(
+        range(len(counted.requests) // 10, len(counted.requests)), 12 if device.type == "cuda" else 3
+    )
     for fatal, message in zip(sorted(places), FAULTS * 4, strict=False):
         run = tmp_path / f"run{fatal}"
         capsys.readouterr()

@@ -1,16 +1,30 @@
 """A power cut at any moment: the last whole checkpoint is never lost, and nothing is read that was not written.
 
-What a run folder's real writers do is recorded, cut at any point, and put on a disk as a power cut may leave it
-(tests/power_cut.py). That is read, and a later life of the run goes on from it, until the next cut.
+What a run folder's real writers do is recorded, cut at any point, and put on a disk as a power cut may leave it. That
+is read, and a later life of the run goes on from it, until the next cut.
+
+The disk promises what POSIX does, and no more. The content of a file is on the disk after `fsync` of the file, and a
+folder's entries are after `fsync` of the folder. Until then, each change may be there or not: of a file's content, the
+new or the old one, a part, or zeros; of a folder's entries, any, in any order, but that an entry's changes keep
+theirs. A rename within a folder happens as a whole or not at all.
 """
 
+from __future__ import annotations
+
+import builtins
+import io
 import json
 import os
 import random
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+import stat
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -24,7 +38,6 @@ from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
 from nexwarp.run import folder
 from nexwarp.run.folder import (
-    CONFIG_FILE,
     LOG_FILE,
     METRICS_FILE,
     RunRecord,
@@ -36,105 +49,239 @@ from nexwarp.run.folder import (
 )
 from nexwarp.run.log import _open_log, keep_lines
 from nexwarp.train import checkpoint
-from nexwarp.train.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
+from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.recipe import Config
 from tests.model_file_support import make_model
-from tests.power_cut import Mark, Recorder, after_power_cut, recorded
 from tests.scenes import make_camera, random_scene
 
+Numbers = set[int | None] | None  # None allows any, and what is damaged
+Allowed = tuple[set[int | None], Numbers, Numbers]  # the run, the iteration of its checkpoint, the run of its model
 DEMO = SceneSource("demo")
 RUN = Path("runs") / "run"
 REPLAYS = int(os.environ.get("NEXWARP_REPLAYS", "1000"))
 CUTS_A_LIFE = 25
+ROOT = 0  # node of the folder that is recorded
+CALLS = ("open", "mkdir", "rename", "replace", "unlink", "remove", "rmdir")
+
+
+# What happened: "data", of a file, its content; "entries", of a folder, those that changed, in one step, None where one
+# is gone; "synced", a file's content or a folder's entries; "allow", what may be found from here on.
+Operation = tuple[str, int, Any]
 
 
 @dataclass
-class Promise:
-    """What a run folder must hold after a power cut; None among numbers is none."""
+class Tree:
+    """Files and folders: contents and entries by node."""
 
-    runs: set[int | None] = field(default_factory=lambda: {None})  # numbers of the runs that it may be
-    run: int | None = None  # the newest run whose config was written
-    least: int | None = None  # iteration of the newest checkpoint of that run whose writing returned
-    most: int | None = None  # iteration of the newest checkpoint that was begun
-    models: set[int | None] = field(default_factory=lambda: {None})  # numbers of the runs whose model may be there
-    torn: bool = False  # the run was being overwritten, and has lost files by that
+    files: dict[int, bytes] = field(default_factory=dict)
+    folders: dict[int, dict[str, int | None]] = field(default_factory=lambda: {ROOT: {}})
 
-    def after(self, recorder: Recorder, moment: int) -> "Promise":
-        """Return the promise after so many operations."""
-        now = replace(self, runs=set(self.runs), models=set(self.models))
-        for operation in recorder.operations[:moment]:
-            if isinstance(operation, Mark):
-                now._note(*operation.label)
-        return now
-
-    def _note(self, what: str, number: int) -> None:
-        if what == "create":
-            self.runs.add(number)
-        elif what == "created":
-            vars(self).update(vars(Promise(runs={number}, run=number)))
-        elif what == "save":
-            self.most = number
-        elif what == "saved":
-            self.least = number
-        elif what == "write model":
-            self.models.add(number)
-        else:
-            self.models = {number}
+    def write(self, target: Path, node: int = ROOT) -> None:
+        """Make a folder of what can be reached."""
+        target.mkdir()
+        for name, inner in self.folders[node].items():
+            if inner in self.folders:
+                self.write(target / name, inner)
+            elif inner is not None:
+                (target / name).write_bytes(self.files.get(inner, b""))
 
 
-def live(root: Path, number: int, mark: Callable[[str, int], None], chance: random.Random) -> None:
-    """Go on with the run of a folder, or begin one with this number; the writers are those of a training."""
+class Recorder:
+    """Compares a folder with what it was before each call to the file system.
+
+    `start` is what was there in the beginning, all of it on the disk; `operations` is what has happened since, in
+    order; `folders` are the nodes that are folders.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.operations: list[Operation] = []
+        self.folders: set[int] = set()
+        self._nodes: dict[int, int] = {}  # by inode, which a later file may get anew
+        self._count = ROOT
+        self._thread = threading.get_ident()
+        self._nodes[root.stat().st_ino] = ROOT
+        self.start = self._last = self._scan()
+
+    def allow(self, run: set[int | None], checkpoint: Numbers, model: Numbers) -> None:
+        """Note what may be found from this point of the record on."""
+        self.look()
+        self.operations.append(("allow", ROOT, (run, checkpoint, model)))
+
+    def look(self) -> None:
+        """Record what has changed."""
+        now, before = self._scan(), self._last
+        for node, entries in now.folders.items():
+            old = before.folders.get(node, {})
+            changes = {name: entries.get(name) for name in old | entries if old.get(name) != entries.get(name)}
+            if changes:
+                self.operations.append(("entries", node, changes))
+        for node, content in now.files.items():
+            if content != before.files.get(node, b""):
+                self.operations.append(("data", node, content))
+        self._last = now
+
+    def synced(self, number: int) -> None:
+        """Record that a file or folder is synced."""
+        self.look()
+        node = self._nodes.get(os.fstat(number).st_ino)
+        if node is not None:  # else it is not below the folder
+            self.operations.append(("synced", node, None))
+
+    def _scan(self) -> Tree:
+        tree, seen = Tree(), {self.root.stat().st_ino}
+        self._scan_folder(self.root, ROOT, tree, seen)
+        self._nodes = {inode: node for inode, node in self._nodes.items() if inode in seen}
+        self.folders |= tree.folders.keys()
+        return tree
+
+    def _scan_folder(self, folder: Path, node: int, tree: Tree, seen: set[int]) -> None:
+        entries = tree.folders[node] = {}
+        for name in sorted(os.listdir(folder)):
+            status = (folder / name).stat()
+            seen.add(status.st_ino)
+            if status.st_ino not in self._nodes:
+                self._count += 1
+                self._nodes[status.st_ino] = self._count
+            inner = entries[name] = self._nodes[status.st_ino]
+            if stat.S_ISDIR(status.st_mode):
+                self._scan_folder(folder / name, inner, tree, seen)
+            else:
+                with _open(folder / name, "rb") as file:
+                    tree.files[inner] = file.read()
+
+    def recorded(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function that looks before each of its calls in this thread."""
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() != self._thread:
+                return original(*args, **kwargs)
+            self.look()
+            return original(*args, **kwargs)
+
+        return call
+
+
+_open = io.open
+
+
+@contextmanager
+def recorded(root: Path) -> Iterator[Recorder]:
+    """Record what the block asks of the file system below a folder; syncing takes no time."""
+    recorder = Recorder(root)
+    with pytest.MonkeyPatch.context() as patch:
+        for name in CALLS:
+            patch.setattr(os, name, recorder.recorded(getattr(os, name)))
+        opening = recorder.recorded(_open)
+        patch.setattr(builtins, "open", opening)
+        patch.setattr(io, "open", opening)
+        patch.setattr(os, "fsync", recorder.synced)
+        yield recorder
+    recorder.look()
+
+
+def after_power_cut(recorder: Recorder, moment: int, chance: random.Random) -> Tree:
+    """Return one of the trees that a power cut after so many operations may leave."""
+    operations = recorder.operations[:moment]
+    latest, loss = moment, 0.3
+    if chance.random() < 0.5:  # a disk that writes in order: what is there is all that was done up to a point
+        last_sync = max((i for i, operation in enumerate(operations) if operation[0] == "synced"), default=0)
+        latest, loss = chance.randint(last_sync, moment), 0.0
+    contents = defaultdict(lambda: [b""], {node: [content] for node, content in recorder.start.files.items()})
+    folders = {node: dict(recorder.start.folders.get(node, {})) for node in recorder.folders}
+    waiting: dict[int, list[tuple[int, dict[str, int | None]]]] = defaultdict(list)
+    for index, (kind, node, value) in enumerate(operations):
+        if kind == "data" and index < latest:
+            contents[node].append(value)
+        elif kind == "entries":
+            waiting[node].append((index, value))
+        elif kind == "synced":
+            contents[node] = contents[node][-1:]
+            for _, changes in waiting.pop(node, []):
+                folders[node].update(changes)
+    for node, all_changes in waiting.items():
+        lost: set[str] = set()
+        for index, changes in all_changes:
+            if index >= latest or chance.random() < loss or lost & changes.keys():
+                lost |= changes.keys()
+            else:
+                folders[node].update(changes)
+    return Tree({node: _surviving(versions, chance) for node, versions in contents.items()}, folders)
+
+
+def _surviving(versions: list[bytes], chance: random.Random) -> bytes:
+    """Return a content that a file may have, of which the first version alone is on the disk for certain."""
+    i = chance.randrange(len(versions))
+    if i == len(versions) - 1 or chance.random() < 0.3:
+        return versions[i]
+    old, new = versions[i], versions[i + 1]
+    place = chance.randint(0, len(new))
+    return chance.choice(
+        [new[:place], bytes(len(new)), new[:place] + bytes(len(new) - place), new[:place] + old[place:]]
+    )
+
+
+def found_in(root: Path) -> list[Any]:
+    """Return what a reader finds: a run, the iteration of its checkpoint, the run of its model; None where none is."""
     run = root / RUN
-    known = (run / CONFIG_FILE).is_file()
-    overwrite = known and (chance.random() < 0.3 or found_in(root).torn)
-    with claimed_run(run, DEMO, resume=known and not overwrite, overwrite=overwrite) as resumed:
-        first = 0
+
+    def of_checkpoint() -> int:
+        tensors, state = load_checkpoint(run)
+        assert state["run"] == read_run(run).config.seed and tensors["x"].tolist() == [state["iteration"]] * 9
+        return state["iteration"]
+
+    found: list[Any] = []
+    for read in (lambda: read_run(run).config.seed, of_checkpoint, lambda: nw.load(run).meta["iteration"]):
+        try:
+            found.append(read())
+        except MissingError:
+            found.append(None)
+        except NexwarpError:
+            found.append("damaged")
+    return found
+
+
+def live(root: Path, number: int, allow: Callable[..., None], chance: random.Random) -> None:
+    """Go on with the run of a folder, or begin one with this number; the writers are those of a training."""
+    run, before = root / RUN, found_in(root)
+    known, last, model_of = before
+    torn = "damaged" in before  # the run was being overwritten
+    allow({known}, None if torn else {last}, None if torn else {model_of})
+    overwrite = known is not None and (torn or chance.random() < 0.3)
+    with claimed_run(run, DEMO, resume=known is not None and not overwrite, overwrite=overwrite) as resumed:
         if resumed:
             number = read_run(run).config.seed
             remove_leftovers(run)
-            first = load_checkpoint(run)[1]["iteration"] if has_checkpoint(run) else 0
         else:
-            mark("create", number)
+            # While a run is overwritten, its config is still there when its files are no longer.
+            allow({known, number}, None, None)
             create_run(run, RunRecord(DEMO, Config(seed=number)))
-            mark("created", number)
+            last = model_of = None
+            allow({number}, {None}, {None})
+        first = int(last or 0)
         keep_lines(run / LOG_FILE, first)
         with _open_log(run / LOG_FILE) as log:
             for iteration in range(first + 1, first + chance.randint(2, 5)):
                 log.write(json.dumps({"iteration": iteration}) + "\n")
                 log.flush()
-                mark("save", iteration)
+                allow({number}, {last, iteration}, {model_of})
                 save_checkpoint(run, {"x": torch.full((9,), float(iteration))}, {"iteration": iteration, "run": number})
-                mark("saved", iteration)
+                last = iteration
+                allow({number}, {last}, {model_of})
         model = make_model(4)
         model.meta["iteration"] = number
-        mark("write model", number)
+        allow({number}, {last}, {model_of, number})
         save_model(run, model)
-        mark("wrote model", number)
+        allow({number}, {last}, {number})
         save_cameras(run / CAMERAS_FILE, {"train": {"a": make_camera(random_scene(4))}, "test": {}})
         write_json(run / METRICS_FILE, {"psnr": 20.0})
 
 
-def check(root: Path, promise: Promise) -> None:
-    """Fail unless a folder keeps what was promised; reading it never fails otherwise than with an error of ours."""
-    run = root / RUN
-    try:
-        number: int | None = read_run(run).config.seed
-    except MissingError:
-        number = None
-    assert number in promise.runs
-    # While a run is overwritten, its config is still there when its files are no longer.
-    overwritten = promise.torn or len(promise.runs) > 1
-    least, most = (None, None) if number != promise.run else (promise.least, promise.most)
-    try:
-        tensors, state = load_checkpoint(run)
-        assert state["run"] == number and tensors["x"].tolist() == [state["iteration"]] * 9
-        assert most is not None and (1 if overwritten else least or 1) <= state["iteration"] <= most
-    except NexwarpError as error:
-        assert overwritten or (least is None and isinstance(error, MissingError)), error
-    try:
-        assert number_of(run) in (promise.models if number == promise.run else {None})
-    except MissingError:
-        assert overwritten or None in promise.models
+def check(root: Path, allowed: Allowed) -> None:
+    """Fail unless a folder holds what is allowed; reading it never fails otherwise than with an error of ours."""
+    run, found = root / RUN, found_in(root)
+    assert all(numbers is None or value in numbers for value, numbers in zip(found, allowed, strict=True)), found
+    assert found[2] in (None, found[0]), "the model is the run's"
     read_metrics(run)
     if (run / CAMERAS_FILE).exists():
         load_cameras(run)
@@ -154,44 +301,22 @@ def replay(folder: Path, count: int, seed: int = 0) -> int:
     chance = random.Random(seed)
     root = folder / "0"
     root.mkdir()
-    promise, done, met = Promise(), 0, 0
+    done = met = 0
     while done < count:
         with recorded(root) as recorder:
-            live(root, done + 1, recorder.mark, chance)
+            live(root, done + 1, recorder.allow, chance)
         shutil.rmtree(root)
         for number in range(done + 1, min(done + CUTS_A_LIFE, count) + 1):
-            moment = chance.randint(0, len(recorder.operations))
-            kept = promise.after(recorder, moment)
-            met += kept.least is not None
+            moment = chance.randint(1, len(recorder.operations))
+            allowed = [value for kind, _, value in recorder.operations[:moment] if kind == "allow"][-1]
+            met += allowed[1] is not None and None not in allowed[1]
             root = folder / str(number)
             after_power_cut(recorder, moment, chance).write(root)
-            check(root, kept)
+            check(root, allowed)
             if number % CUTS_A_LIFE and number < count:
                 shutil.rmtree(root)
-        done, promise = number, found_in(root)  # the next life goes on from the last cut
+        done = number  # the next life goes on from the last cut
     return met
-
-
-def found_in(root: Path) -> Promise:
-    """Return what a folder promises that nothing is being written to."""
-    run, found = root / RUN, Promise()
-    if (run / CONFIG_FILE).exists():
-        found.run = read_run(run).config.seed
-        found.runs = {found.run}
-    try:
-        found.least = found.most = load_checkpoint(run)[1]["iteration"]
-    except NexwarpError as error:
-        found.torn = not isinstance(error, MissingError)
-    if (run / "model.safetensors").exists():
-        found.models = {number_of(run)}
-    return found
-
-
-def number_of(run: Path) -> int:
-    """Return the number of the run that a model is of."""
-    number = nw.load(run).meta["iteration"]
-    assert isinstance(number, int)
-    return number
 
 
 @pytest.mark.parametrize("count", [50, pytest.param(REPLAYS, marks=pytest.mark.slow)])

@@ -2,7 +2,6 @@
 
 import os
 import random
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,8 @@ import torch
 
 from nexwarp.data import Scene
 from nexwarp.io.files import write_atomically
-from nexwarp.run.folder import remove_leftovers
-from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, has_checkpoint, load_checkpoint, save_checkpoint
+from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, load_checkpoint, save_checkpoint
 from nexwarp.train.trainer import Trainer
-from tests.faults import Killed, kill_at
 from tests.model_file_support import refused
 from tests.trainer_support import small
 
@@ -74,33 +71,6 @@ def test_checkpoint_round_trip(tmp_path):
     assert all(torch.equal(loaded[name], tensors[name]) for name in tensors)
     save_number(tmp_path, 4)
     assert saved_number(tmp_path) == 4 and kept(tmp_path) == [4, 3]
-
-
-@pytest.mark.parametrize("before", [0, 1, 2, 3])
-def test_a_kill_at_any_moment_of_a_save_loses_no_whole_checkpoint(tmp_path, before):
-    """Whatever number of saves came before; and the next save, killed at any moment too, starts from what is left."""
-    moment = 0
-    calls: list[str] = []
-    while moment <= len(calls):
-        run = tmp_path / f"run{moment}"
-        run.mkdir()
-        for number in range(1, before + 1):
-            save_number(run, number)
-        for at in (moment, 3, 7, 11):  # killed again, and again
-            with pytest.MonkeyPatch.context() as patch:
-                done = kill_at(patch, at)
-                with suppress(Killed):
-                    save_number(run, before + 1)
-            calls = done if at == moment else calls
-            if before:
-                assert saved_number(run) in (before, before + 1), (moment, at)
-            else:
-                assert not has_checkpoint(run) or saved_number(run) == 1
-        remove_leftovers(run)  # as --resume does
-        save_number(run, before + 2)
-        assert saved_number(run) == before + 2 and kept(run)[0] == before + 2
-        moment += 1
-    assert moment > 8
 
 
 @pytest.mark.parametrize("name", ["tensors.safetensors", "state.json"])
