@@ -48,13 +48,40 @@ def activated_dot(
 ):
     """Sum of outputs * gradients (a constant is left out): its gradient is the vector-Jacobian product."""
     return (
-        wp.dot(unit(quat), grad_quat)
+        unit_dot(quat, grad_quat)
         + wp.exp(scale[0]) * grad_scale[0]
         + wp.exp(scale[1]) * grad_scale[1]
         + sigmoid(opacity) * grad_opacity
         + wp.exp(gamma[0]) * grad_gamma[0]
         + wp.exp(gamma[1]) * grad_gamma[1]
     )
+
+
+@wp.func
+def unit_dot(quat: Vec4, grad: Vec4):
+    """Unit quaternion times its gradient: its gradient is the vector-Jacobian product."""
+    return wp.dot(unit(quat), grad)
+
+
+@functools.cache
+def unit_kernels(real: type) -> SimpleNamespace:
+    """Make the kernels of quaternion / length alone."""
+    vec4 = types(real).vec4
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def unit_quats(first: wp.int32, quats: wp.array(dtype=vec4), units: wp.array(dtype=vec4)):
+        i = first + wp.tid()
+        units[i] = unit(quats[i])
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def unit_quats_backward(
+        first: wp.int32, quats: wp.array(dtype=vec4), grads: wp.array(dtype=vec4), grad_quats: wp.array(dtype=vec4)
+    ):
+        i = first + wp.tid()
+        grad_quat, _grad = wp.grad(unit_dot)(quats[i], grads[i])
+        grad_quats[i] = grad_quat
+
+    return SimpleNamespace(forward=unit_quats, backward=unit_quats_backward)
 
 
 @functools.cache

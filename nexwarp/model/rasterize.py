@@ -5,15 +5,17 @@ from collections.abc import Sequence
 
 import numpy.typing as npt
 import torch
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import pad
 
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
-from nexwarp.errors import check_tensors
+from nexwarp.errors import OutOfMemoryError, check_tensors
+from nexwarp.machine import needed_memory
 from nexwarp.model.options import Color, RenderOptions, color_tensor
 from nexwarp.model.render import check_camera, memory_error, pinhole_of, prepare_device
 from nexwarp.model.surfels import Activated, check_coefficients
 from nexwarp.model.texture import Hits
+from nexwarp.ops.activate import unit_quats
 from nexwarp.ops.collect import CHANNELS
 
 Values = torch.Tensor | npt.ArrayLike  # arrays and lists become tensors of the camera's dtype, on its device
@@ -72,8 +74,9 @@ def rasterize(  # noqa: PLR0913  # gsplat's order of arguments
             return hits[0]
         return Hits(*(torch.stack([getattr(x, field.name) for x in hits]) for field in dataclasses.fields(Hits)))
     except (MemoryError, RuntimeError) as error:
-        refusal = memory_error(error, cameras[0], max_hits)
-    raise refusal  # outside of the handler, see `draw`
+        if isinstance(error, OutOfMemoryError) or (needed := needed_memory(error)) is None:
+            raise
+    raise memory_error(needed, cameras[0], max_hits)  # outside of the handler, see `draw`
 
 
 def compose(hits: Hits, colors: torch.Tensor, background: Color | None = None) -> torch.Tensor:
@@ -128,18 +131,22 @@ def _rasterize(
 ) -> Hits:
     """Draw one camera: one walk blends 3 + 16 channels, and a further one each further 16."""
     with torch.autocast(shape.means.device.type, enabled=False):
-        shape = shape._replace(quats=normalize(shape.quats, dim=-1))
+        shape = shape._replace(quats=unit_quats(shape.quats))
         if colors.ndim == 3:
             colors = ops.plain_colors(colors, shape.means, camera.position, 3)
         channels, pinhole = colors.shape[1], pinhole_of(camera, shape.means)
-        projection = ops.project(*shape, pad(colors[:, :3], (0, max(3 - channels, 0))), camera.viewmat)
+        first = colors if channels == 3 else pad(colors[:, :3], (0, max(3 - channels, 0)))
+        projection = ops.project(*shape, first, camera.viewmat)
         tiles = ops.intersect_tiles(shape, projection, camera.viewmat, pinhole)
         groups: list[torch.Tensor | None] = [None]
         if channels > 3:
             groups = [pad(x, (0, CHANNELS - x.shape[1])) for x in colors[:, 3:].split(CHANNELS, dim=1)]
         walks = [ops.collect(projection, tiles, pinhole, max_hits=max_hits, channels=x) for x in groups]
         hits = walks[0]
-        plain = torch.cat([hits.plain, *(x.channels for x in walks if x.channels is not None)], dim=-1)[..., :channels]
+        plain = hits.plain
+        if channels != 3:
+            more = [x.channels for x in walks if x.channels is not None]
+            plain = torch.cat([plain, *more], dim=-1)[..., :channels]
         if background is not None:
             plain = plain + (1 - hits.alpha)[..., None] * background
         points, directions = ops.unproject(hits.depths, camera.viewmat, pinhole)

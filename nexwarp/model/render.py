@@ -247,15 +247,14 @@ def draw(
             stages = Intermediates(projection, hits, texels, residual, factors, tiles, pinhole, camera.viewmat)
             return Rendering(*buffers, stages)
     except (MemoryError, RuntimeError) as error:
-        refusal = memory_error(error, camera, options.max_hits)
-    # Outside of the handler: the error's traceback would keep alive what has been allocated.
-    raise refusal
+        if isinstance(error, OutOfMemoryError) or (needed := needed_memory(error)) is None:
+            raise
+    # Outside of the handler, and by no name: tracebacks would keep alive what has been allocated.
+    raise memory_error(needed, camera, options.max_hits)
 
 
-def memory_error(error: MemoryError | RuntimeError, camera: Camera | RayCamera, max_hits: int) -> OutOfMemoryError:
-    """Return the error of a rendering that lacked memory; raise one of another kind again."""
-    if isinstance(error, OutOfMemoryError) or (needed := needed_memory(error)) is None:
-        raise error
+def memory_error(needed: str, camera: Camera | RayCamera, max_hits: int) -> OutOfMemoryError:
+    """Return the error of a rendering that lacked memory, of which it needed so much."""
     return OutOfMemoryError.of(f"an image of {camera.width}x{camera.height} pixels with K = {max_hits}", needed)
 
 

@@ -16,6 +16,7 @@ from nexwarp.data.scene import SceneSource
 from nexwarp.errors import NexwarpError, OutOfMemoryError
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.types import types
+from nexwarp.machine import needed_memory
 from nexwarp.model.buffers import render_buffers
 from nexwarp.model.model_file import save_model
 from nexwarp.ops import _interop, memory, tiles
@@ -180,7 +181,6 @@ def test_an_allocation_that_fails_is_our_error_and_frees_what_there_was(monkeypa
     ) as told:
         model.render(camera)
     assert told.value.needed == needed
-    gc.collect()
     assert kept[0]() is None
     monkeypatch.undo()
     assert torch.equal(model.render(camera).image, expected)
@@ -195,6 +195,34 @@ def test_other_errors_stay_what_they_are(monkeypatch):
     monkeypatch.setattr(tiles, "_tile_polygons", fail)
     with pytest.raises(RuntimeError, match=r"^shape mismatch$"):
         nw.render(surfels, texture, camera)
+
+
+@pytest.mark.parametrize(
+    "error", [RuntimeError("shape mismatch"), torch.OutOfMemoryError("Tried to allocate 2.5 GiB.")]
+)
+def test_what_an_error_leaves_is_freed_without_the_garbage_collector(monkeypatch, error):
+    """As a CUDA graph of a step that cannot be captured: the step is launched next, and needs the memory."""
+    surfels, texture, camera = parts()
+    kept: list[weakref.ref[torch.Tensor]] = []
+
+    def fail(shape: list[torch.Tensor], *_: Any) -> None:
+        kept.append(weakref.ref(shape[2]))
+        raise type(error)(*error.args)
+
+    monkeypatch.setattr(tiles, "_tile_polygons", fail)
+    plain = {name: x.detach() for name, x in surfels.activated()._asdict().items()}
+    colors = torch.zeros(len(surfels), 3)
+    gc.disable()
+    try:
+        for draw in (
+            lambda: nw.render(surfels, texture, camera),
+            lambda: nw.rasterize(**plain | {"scales": 2 * plain["scales"]}, colors=colors, camera=camera),
+        ):
+            with pytest.raises(OutOfMemoryError if needed_memory(error) else type(error)):
+                draw()
+            assert kept[-1]() is None
+    finally:
+        gc.enable()
 
 
 def test_a_training_says_what_to_lower_when_a_rendering_is_refused(tiny_scene, monkeypatch):

@@ -5,6 +5,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp import ops
+from nexwarp.ops.activate import unit_quats
 from tests.narrowing import total
 from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close, assert_finite
@@ -96,6 +97,16 @@ def test_extremes_are_finite_and_what_torch_gives(dtype: torch.dtype, device: to
     lengths = surfels.raw_quats.detach().norm(dim=-1, keepdim=True).clamp_min(1e-12)
     for row in range(len(surfels)):
         assert_close((ours * lengths)[row], (torchs * lengths)[row], kind="gradient", name=f"quaternion {row}")
+
+
+def test_unit_quaternions_alone(device: torch.device) -> None:
+    raw = make_raw(100, torch.float64, device).raw_quats
+    expected = torch.nn.functional.normalize(raw, dim=-1)
+    signal = torch.randn_like(raw)
+    actual = unit_quats(raw)
+    assert_exact(actual, expected, "value", "quats")
+    grads = (torch.autograd.grad(x, raw, signal)[0] for x in (actual, expected))
+    assert_close(*grads, kind="gradient", name="quats")
 
 
 def test_gradcheck(device: torch.device) -> None:

@@ -112,6 +112,7 @@ def test_harmonics_give_the_bits_of_a_rendering(device):
     camera = make_camera(scene)
     surfels = nw.Surfels.from_activated(*(scene[name] for name in SURFEL_KEYS))
     shape: dict[str, Any] = {name: x.detach() for name, x in surfels.activated()._asdict().items()}
+    shape["quats"] = surfels.raw_quats.detach()  # of any length; unit ones would be rounded twice
     hits, out = (
         nw.rasterize(**shape, colors=scene["sh"], camera=camera, max_hits=4),
         nw.render(surfels, None, camera, 4),
