@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[2]
 FLAGS = ["--iterations", "20", "--max-surfels", "100", "--checkpoint-every", "1"]
 SMALL = Config(texture=TextureConfig(levels=4, table_size=2**10, width=16), densify=DensifyConfig(every=3))
 # When a kill comes: after so many steps, or views of a stage of the finishing, up to all training views.
-STAGES = ("training", "smoothing SH", "measuring detail limits", "ordering surfels")
+STAGES = ("training", "smoothing SH", "measuring detail limits")
 MOMENTS = [(stage, count) for count in (4, 2, 8) for stage in STAGES]
 
 
