@@ -68,10 +68,11 @@ def scalars(x: Array) -> Array:
 
 
 def train(x: Mapping[str, Array], resolutions: Array, views: list[nw.View], steps: int) -> list[float]:
-    """Train on views in turn; return the losses."""
+    """Train on views in turn, whose cameras are on the device of the parameters; return the losses."""
     grads = [scalars(parameter.grad) for parameter in x.values()]
     optimizer, losses = Adam([scalars(parameter) for parameter in x.values()], lr=RATE), []
-    photos = [array(view.image.reshape(-1, 3) / 255.0, 1) for view in views]
+    device = wp.device_to_torch(resolutions.device)
+    photos = [array(view.image.to(device).reshape(-1, 3) / 255.0, 1) for view in views]
     for step in range(steps):
         camera, photo = views[step % len(views)].camera, photos[step % len(views)]
         tape, loss = wp.Tape(), wp.zeros(1, dtype=float, requires_grad=True, device=photo.device)
