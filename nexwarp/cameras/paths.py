@@ -79,13 +79,13 @@ def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[
     radii = torch.quantile(((centres - centre) @ axes.T).abs(), SPREAD, dim=0)
     if radii.max() == 0.0:
         raise ValueError(f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place")
-    target = _common_target(cameras)
+    target, share = focus_ahead(cameras)
     angles = torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
     rounds = torch.stack([torch.cos(turns * angles), torch.sin(turns * angles), torch.sin(angles)], dim=1)
     first = cameras[0]
     path: list[Camera] = []
     for position in centre + rounds * radii @ axes:
-        viewmat = look_at(position, position + forward if target is None else target, up)
+        viewmat = look_at(position, target if share == 1.0 else position + forward, up)
         path.append(replace(first, viewmat=viewmat.to(first.viewmat)))
     return path
 
@@ -248,14 +248,15 @@ def _fit_ellipse(viewmats: torch.Tensor, centres: torch.Tensor) -> tuple[torch.T
     return mean + (low + high) / 2.0 @ axes, axes, (high - low) / 2.0
 
 
-def _common_target(cameras: Sequence[Camera]) -> torch.Tensor | None:
-    """`focus(cameras)` if it lies in front of all cameras; None if not, or if the optical axes are parallel."""
+def focus_ahead(cameras: Sequence[Camera]) -> tuple[torch.Tensor, float]:
+    """Return `focus(cameras)` and the share of the cameras that it lies in front of; 0 where there is no focus."""
     try:
         target = focus(cameras)
     except ValueError:
-        return None
+        return torch.zeros(3, dtype=torch.float64), 0.0
     viewmats, _ = camera_poses(cameras)
-    return target if bool(((viewmats[:, :3, :3] @ target + viewmats[:, :3, 3])[:, 2] > 0.0).all()) else None
+    ahead = (viewmats[:, :3, :3] @ target + viewmats[:, :3, 3])[:, 2] > 0.0
+    return target, ahead.double().mean().item()
 
 
 PATHS = {"ellipse": ellipse, "interpolate": interpolate, "spiral": spiral}

@@ -1,18 +1,41 @@
-"""Surfels as Gaussians for renderers of 3D Gaussian splatting, which linearise the projection at each centre.
+"""Surfels as files: PLY with all parameters, and Gaussians for viewers of 3D Gaussian splatting, as PLY or SPZ.
 
-The linearisation is accurate for Gaussians that are small compared with their distance. A large surfel therefore
-becomes a grid of smaller, overlapping Gaussians in its plane, whose blended alpha approximates the surfel's.
+PLY files are little-endian lists of vertices whose properties have one floating type. Names and activations are those
+of 3DGS's files: `opacity` is a logit, `scale_*` are logarithms, `rot_*` is a quaternion wxyz, surfel to world, `f_dc_*`
+are the constant SH coefficients of red, green and blue, `f_rest_*` the others: all of red, then green, then blue.
+
+Viewers linearise the projection at each Gaussian's centre, which is accurate for Gaussians that are small compared with
+their distance. A large surfel therefore becomes a grid of smaller, overlapping Gaussians in its plane, whose blended
+alpha approximates the surfel's.
 """
 
+import gzip
 import math
-from collections.abc import Sequence
+import os
+import tempfile
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.errors import FormatError
+from nexwarp.export.bake import points_on
+from nexwarp.io.files import one_line, write_atomically
+from nexwarp.io.ply import write_elements
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN
+from nexwarp.model.surfels import Surfels
+
+MAX_EXTENT = 0.3  # largest scale of an exported Gaussian, as a fraction of its distance to the nearest camera
+THINNESS = 1e-3  # third scale of an exported Gaussian, as a fraction of the surfel's smaller scale
+SPLAT_DEGREE = 3  # SH degree whose coefficients viewers expect
+SURFELS = "nexwarp surfels: gamma = 1 + exp(gamma_i), scale = exp(scale_i), opacity = sigmoid(opacity), rot is wxyz"
+SPLATS = "nexwarp surfels as 3DGS Gaussians: the plain appearance, without texture, with gamma = 1"
 
 SPACING = 1.4  # between neighbouring pieces, in their standard deviations: leaves a ripple below 2 %
 MOST_STEPS = 16  # pieces on either side of a surfel's centre, along one axis
@@ -21,6 +44,155 @@ MOST_PIECES, PIECES_EACH = 50_000, 16  # in all, and more for each surfel, befor
 LEVELS = 128  # opacities that grids are fitted for; other opacities scale the nearest grid
 FITTING_STEPS = 40
 WIDTHS = (1.0, 0.95, 0.9, 0.85, 0.8, 0.75, 0.7)  # candidates of a row of pieces, in standard deviations of the surfel
+
+# SPZ has 24 bits for a coordinate; its header says how many of them are behind the point. GaussForge writes 12.
+COORDINATE_BITS, WRITTEN_BITS, FRACTION_BYTE = 24, 12, 13
+LARGEST_COORDINATE = 2.0 ** (COORDINATE_BITS - 1 - WRITTEN_BITS) - 1  # values beyond would wrap around
+MOST_SHIFT = 12  # more or fewer fractional bits
+SMALLEST_SCALE, LARGEST_SCALE = -10.0, 5.9375  # logarithms, in steps of 1/16
+LARGEST_LOSS = 0.01
+ARRAYS = ("positions", "scales", "rotations", "alphas", "colors", "sh")
+
+
+def save_surfels_ply(path: str | os.PathLike[str], surfels: Surfels) -> None:
+    """Write surfels with all their properties, bit for bit.
+
+    Properties: `x y z`, `nx ny nz` (unit normal, for viewers), `f_dc_0..2`, `f_rest_*` (3 (C - 1)), `opacity`
+    (logit), `scale_0 scale_1` (logarithms), `rot_0..3` (wxyz, not normalised), `gamma_0 gamma_1` (log(gamma - 1)).
+    """
+    raw = surfels.state_dict()
+    groups = {
+        "x y z": raw["means"],
+        "nx ny nz": surfels.normals,
+        "f_dc": raw["sh0"][:, 0],
+        "f_rest": raw["shN"].mT.flatten(1),
+        "opacity": raw["logit_opacities"],
+        "scale": raw["log_scales"],
+        "rot": raw["raw_quats"],
+        "gamma": raw["raw_gammas"],
+    }
+    write_elements(path, {"vertex": _columns(groups)}, SURFELS)
+
+
+def save_splats_ply(
+    path: str | os.PathLike[str],
+    surfels: Surfels,
+    sh_degree: int = SPLAT_DEGREE,
+    *,
+    cameras: Sequence[Camera] = (),
+    max_extent: float = MAX_EXTENT,
+) -> None:
+    """Write surfels as Gaussians for viewers of 3D Gaussian splatting, without the texture and with gamma = 1.
+
+    Each surfel becomes a flat Gaussian, whose third scale is a thousandth of the smaller of the other two, or several
+    of them where it is large for one of the cameras; these come last.
+
+    Properties: `x y z`, `nx ny nz`, `f_dc_0..2`, `f_rest_0..44` (0 above `sh_degree`), `opacity` (logit),
+    `scale_0..2` (logarithms), `rot_0..3` (wxyz, unit), all float32.
+
+    Args:
+        path: file to write, atomically.
+        surfels: the surfels, on any device.
+        sh_degree: largest SH degree to write, 0 to 3; higher coefficients are 0.
+        cameras: cameras to render accurately from; without any, each surfel is one Gaussian.
+        max_extent: largest scale of a Gaussian, as a fraction of its distance to the nearest camera; `math.inf` splits
+            nothing.
+    """
+    raw = surfels.state_dict()
+    pieces = split_large(surfels.means, surfels.scales, surfels.opacities, cameras, max_extent)
+    ids, whole = pieces.ids, pieces.whole
+    means = raw["means"][ids]
+    means[whole:] = points_on(surfels, ids[whole:], pieces.offsets[whole:])
+    rest = raw["shN"].new_zeros(len(surfels), (SPLAT_DEGREE + 1) ** 2 - 1, 3)
+    kept = raw["shN"][:, : (sh_degree + 1) ** 2 - 1]
+    rest[:, : kept.shape[1]] = kept
+    scales = torch.cat([raw["log_scales"][ids[:whole]], pieces.scales[whole:].log()])
+    groups = {
+        "x y z": means,
+        "nx ny nz": surfels.normals[ids],
+        "f_dc": raw["sh0"][ids, 0],
+        "f_rest": rest[ids].mT.flatten(1),
+        "opacity": torch.cat([raw["logit_opacities"][ids[:whole]], pieces.opacities[whole:].logit()]),
+        "scale": torch.cat([scales, scales.amin(dim=1, keepdim=True) + math.log(THINNESS)], dim=1),
+        "rot": surfels.quats[ids],
+    }
+    columns = _columns({name: values.float() for name, values in groups.items()})
+    write_elements(path, {"vertex": columns}, SPLATS)
+
+
+def _columns(groups: Mapping[str, torch.Tensor]) -> dict[str, np.ndarray]:
+    """Return columns by name: those of "x y z" are x, y and z; the two of "gamma" gamma_0 and gamma_1."""
+    columns: dict[str, np.ndarray] = {}
+    for group, values in groups.items():
+        numbered = [f"{group}_{i}" for i in range(values.shape[-1])]
+        names = group.split() if " " in group or values.ndim == 1 else numbered
+        columns |= zip(names, values.detach().cpu().numpy().reshape(len(values), len(names)).T, strict=True)
+    return columns
+
+
+def save_splats_spz(
+    path: str | os.PathLike[str],
+    surfels: Surfels,
+    sh_degree: int = SPLAT_DEGREE,
+    *,
+    cameras: Sequence[Camera] = (),
+    max_extent: float = MAX_EXTENT,
+) -> None:
+    """Write the Gaussians of `save_splats_ply`, whose arguments these are, as an SPZ file.
+
+    Positions have steps of 2^-24 world units, or 2^-22 of the farthest coordinate; 1/4096 units where few
+    Gaussians are farther than 2,047 units from the origin, which are left out. UserWarning where more than 1 % of the
+    Gaussians are smaller or larger than the format can say. FormatError: no Gaussians, or too far ones.
+    """
+    import gaussforge
+
+    if not len(surfels):
+        raise FormatError(f"{path}: expected surfels to write, the model has none")
+    with tempfile.TemporaryDirectory() as folder:
+        ply = Path(folder) / "splats.ply"
+        save_splats_ply(ply, surfels, sh_degree, cameras=cameras, max_extent=max_extent)
+        content = ply.read_bytes()
+    library = gaussforge.GaussForge()
+    gaussians = _checked(path, library.read(content, "ply"))
+    count = gaussians["numPoints"]
+    arrays = {name: np.frombuffer(gaussians[name], np.float32).reshape(count, -1) for name in ARRAYS}
+    reach = np.abs(arrays["positions"]).max(axis=1)
+    shift = _shift(float(reach.max()))
+    if shift < 0 and (reach >= LARGEST_COORDINATE).mean() <= LARGEST_LOSS:
+        shift = 0  # a few far ones would cost all others their precision
+    near = reach * 2.0**shift < LARGEST_COORDINATE
+    if (~near).mean() > LARGEST_LOSS:
+        raise FormatError(
+            f"{path}: SPZ holds Gaussians up to {LARGEST_COORDINATE * 2.0**-shift:,.0f} units from the origin, "
+            f"{(~near).sum():,} of {count:,} are farther away; use --format ply"
+        )
+    large = arrays["scales"][:, :2]  # the third is thin on purpose
+    lost = ((large < SMALLEST_SCALE - 0.03) | (large > LARGEST_SCALE + 0.03)).any(axis=1)
+    if lost.mean() > LARGEST_LOSS:
+        warnings.warn(
+            f"{path}: SPZ holds scales from {math.exp(SMALLEST_SCALE):.2g} to {math.exp(LARGEST_SCALE):.3g} units; "
+            f"{lost.sum():,} of {count:,} Gaussians have others, and change their size; use --format ply",
+            stacklevel=2,
+        )
+    arrays["positions"] = arrays["positions"] * np.float32(2.0**shift)
+    gaussians |= {name: array[near].tobytes() for name, array in arrays.items()} | {"numPoints": int(near.sum())}
+    packed = bytearray(gzip.decompress(_checked(path, library.write(gaussians, "spz"))))
+    packed[FRACTION_BYTE] += shift
+    write_atomically(Path(path), gzip.compress(packed, mtime=0))
+
+
+def _shift(farthest: float) -> int:
+    """Fractional bits more than 12, or fewer, with which a coordinate still fits."""
+    if farthest * 2.0**MOST_SHIFT < LARGEST_COORDINATE:
+        return MOST_SHIFT
+    return max(math.floor(math.log2(LARGEST_COORDINATE / farthest)), -MOST_SHIFT)
+
+
+def _checked(path: str | os.PathLike[str], answer: Mapping[str, Any]) -> Any:
+    """Return what GaussForge returned, unless that is an error."""
+    if "error" in answer:
+        raise FormatError(f"{path}: GaussForge could not write it ({one_line(answer['error'])})")
+    return answer["data"]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ Another shape with the same parameters, opacity and two exponents, changes these
     kernels/shape.py                    the functions below
     tests/reference/collect.py          the float64 reference that proves the functions
     export/web/shaders/                 the same in WGSL: project.wgsl the reach, collect.wgsl alpha
-    export/web/page/baked_shaders.js    the same in GLSL, for baked pages; export/bake/glb.py draws it as opacities
+    export/web/page/baked_shaders.js    the same in GLSL, for baked pages; export/glb.py draws it as opacities
     examples/read_model.py              the same in NumPy
 
 Another number of parameters also changes the record (kernels/surfel.py, kernels/project.py), activation and

@@ -1,5 +1,6 @@
 """Export of run folders to the formats of other programs."""
 
+import importlib.util
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,17 +17,17 @@ from nexwarp.data.frame_camera import lens_keys
 from nexwarp.data.images import image_size
 from nexwarp.data.scene import DEMO, SceneSource, demo_folder
 from nexwarp.errors import RunError, SettingError
-from nexwarp.export.bake.fit import bake
-from nexwarp.export.bake.glb import check_package, save_glb
+from nexwarp.export.bake import bake
+from nexwarp.export.glb import save_glb
 from nexwarp.export.mesh import Progress, extract_mesh, save_mesh
-from nexwarp.export.splats_spz import save_splats_spz
-from nexwarp.export.surfels_ply import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_surfels_ply
+from nexwarp.export.splats import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_splats_spz, save_surfels_ply
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import JsonObject, write_json
 from nexwarp.model.model_file import save_model
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, ORIGIN_FILE, TRAIN
 from nexwarp.run.opened import OpenedModel
 
+PACKAGES = {"glb": ("trimesh", "glb"), "spz": ("gaussforge", "splats")}  # that formats need, and their extras
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows
 
 
@@ -57,6 +58,10 @@ class ExportOrder:
             raise SettingError(f"--format: expected one of {', '.join(EXPORTS)}, got {self.format!r}")
         if self.format != "mesh" and (self.voxel is not None or self.far is not None):
             raise SettingError(f"--voxel, --far: expected together with --format mesh, got --format {self.format}")
+        package, extra = PACKAGES.get(self.format, ("torch", ""))
+        if importlib.util.find_spec(package) is None:
+            need = f"--format {self.format}: needs the package {package}, found none"
+            raise SettingError(f"{need}; pip install 'nexwarp[{extra}]'")
 
 
 def export_run(
@@ -108,7 +113,6 @@ def _export(
     elif order.format == "glb":
         if not views:
             raise RunError(f"{opened.path}: --format glb: expected the run's {CAMERAS_FILE}, found none")
-        check_package()
         cameras = list(views.values())
         save_glb(files[0], bake(opened.model.to(device), cameras), cameras)
     else:

@@ -3,14 +3,14 @@
 import pytest
 
 from nexwarp.cli import main as cli
-from nexwarp.export.web import atlas
+from nexwarp.export.web import baked
 from tests.cli.support import refused
 
 
 @pytest.fixture(autouse=True)
 def few_steps(small_preset, monkeypatch):
     """Bake quickly."""
-    monkeypatch.setattr("nexwarp.export.bake.fit.FEWEST_STEPS", 2)
+    monkeypatch.setattr("nexwarp.export.bake.FEWEST_STEPS", 2)
 
 
 def test_a_finished_run_becomes_a_web_page(finished, capsys):
@@ -18,7 +18,7 @@ def test_a_finished_run_becomes_a_web_page(finished, capsys):
         cli.main(["export", str(finished), "--format", "web", "--out", str(finished / "page"), "--device", "cpu"]) == 0
     )
     names = {file.name for file in (finished / "page").iterdir()}
-    assert {"index.html", "viewer.js", "scene.nxw", atlas.BAKED_FILE, atlas.ATLAS_FILE} <= names
+    assert {"index.html", "viewer.js", "scene.nxw", baked.BAKED_FILE, baked.ATLAS_FILE} <= names
     assert "<title>tiny</title>" in (finished / "page" / "index.html").read_text()
 
 
@@ -26,8 +26,8 @@ def test_a_finished_run_becomes_gltf_and_spz(finished, monkeypatch, capsys):
     pytest.importorskip("trimesh")
     refused(capsys, ["export", str(finished), "--format", "glb", "--device", "cpu"], "scene.glb", "opacity above 0.3")
     assert not (finished / "export").exists()
-    monkeypatch.setattr("nexwarp.export.bake.glb.CUTOFF", 0.05)  # surfels of a short training are faint
-    monkeypatch.setattr("nexwarp.export.bake.glb.LEAST_ALPHA", 0.025)
+    monkeypatch.setattr("nexwarp.export.glb.CUTOFF", 0.05)  # surfels of a short training are faint
+    monkeypatch.setattr("nexwarp.export.glb.LEAST_ALPHA", 0.025)
     for package, kind, name in (("trimesh", "glb", "scene.glb"), ("gaussforge", "spz", "splats.spz")):
         pytest.importorskip(package)
         assert cli.main(["export", str(finished), "--format", kind, "--device", "cpu"]) == 0

@@ -9,13 +9,10 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.export.bake.baked import Baked, encode_atlas, mean_colors
-from nexwarp.export.bake.fit import bake, evaluate
-from nexwarp.export.bake.glb import CUTOFF, save_glb, upright
-from nexwarp.export.bake.layout import Layout, lay_out
-from nexwarp.export.bake.observe import Observations, observe
-from nexwarp.export.splats_spz import save_splats_spz
-from nexwarp.export.web.atlas import ATLAS_FILE, BAKED_FILE, encode_baked, encode_harmonics
+from nexwarp.export.bake import Baked, bake, evaluate, lay_out, observe
+from nexwarp.export.glb import CUTOFF, save_glb, upright
+from nexwarp.export.splats import save_splats_spz
+from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE, encode_atlas, encode_baked, encode_harmonics
 from tests.export.web.baked_support import bilinear, composited, ring
 from tests.export.web.scene_reader import as_stored, decode_atlas, decode_harmonics
 from tests.scenes import make_surfels, make_texture, random_scene
@@ -34,10 +31,6 @@ def make_model(residual: bool = True, count: int = 12, sh_degree: int = 1) -> nw
     with torch.no_grad():
         texture.grid.mul_(0.3)
     return nw.Model(make_surfels(scene), texture, options=nw.RenderOptions(background=(0.1, 0.2, 0.3)))
-
-
-def laid_out(seen: Observations, texel: float, side: int) -> Layout:
-    return lay_out(seen.boxes, seen.boxes[:, 2] > seen.boxes[:, 0], seen.pixels, texel=texel, side=side)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +67,7 @@ def test_texels_lie_where_sampling_looks_for_them(baked):
 
 def test_an_atlas_that_is_too_small_has_larger_texels(model, cameras):
     seen = observe(model, list(cameras.values()))
-    large, small = (laid_out(seen, texel=0.5, side=side) for side in (2048, 128))
+    large, small = (lay_out(seen.boxes, seen.pixels, texel=0.5, side=side) for side in (2048, 128))
     assert max(small.width, small.height) <= 128 < max(large.width, large.height)
 
 
@@ -84,8 +77,7 @@ def test_the_first_atlas_has_the_colors_of_the_texture(residual, cameras):
     model = make_model(residual, count=1, sh_degree=0)
     seen = observe(model, list(cameras.values()))
     assert seen.textured[0] == 1
-    layout = laid_out(seen, texel=0.25, side=4096)
-    image = Baked(model, model.surfels, seen, layout, evaluate(model, seen, layout)).render(cameras["1.png"])
+    image = evaluate(model, seen, lay_out(seen.boxes, seen.pixels, texel=0.25)).render(cameras["1.png"])
     expected = model.render(cameras["1.png"]).image.detach()
     plain = model.bare(max_hits=0).render(cameras["1.png"]).image.detach()
     assert psnr(image, expected) > max(45, psnr(plain, expected) + 10)
@@ -101,16 +93,11 @@ def test_images_are_those_of_the_definition(baked, cameras):
 def test_the_fit_approaches_the_model(baked, model, cameras):
     for camera in cameras.values():
         expected = model.render(camera).image.detach()
-        seen = baked.seen
-        first = Baked(model, model.surfels, seen, baked.layout, evaluate(model, seen, baked.layout)).render(camera)
-        plain = untextured_image(model, camera)
+        first = evaluate(model, baked.seen, baked.layout).render(camera)
+        plain = model.bare(max_hits=0).render(camera).image.detach()
         fitted = psnr(as_stored(baked).render(camera), expected)
         assert fitted > psnr(first, expected) + 1, "the fit helps"
         assert fitted > psnr(plain, expected) + 6 and fitted > 24
-
-
-def untextured_image(model: nw.Model, camera: nw.Camera) -> torch.Tensor:
-    return model.bare(max_hits=0).render(camera).image.detach()
 
 
 def test_codes_are_near_the_values(baked):
@@ -152,9 +139,7 @@ def test_the_gltf_file_holds_the_surfels(baked, cameras, tmp_path):
     middle = mesh.visual.uv.reshape(-1, 4, 2).mean(1)
     places = np.stack([middle[:, 0] * image.shape[1], (1 - middle[:, 1]) * image.shape[0]], 1) - 0.5
     found = bilinear(torch.from_numpy(image), torch.from_numpy(places)).numpy()
-    colors = mean_colors(surfels, baked.seen, baked.model.options.sh_degree)[visible] + baked.added(
-        visible, torch.zeros(len(visible), 2)
-    )
+    colors = baked.mean_colors()[visible] + baked.added(visible, torch.zeros(len(visible), 2))
     assert np.abs(found[:, :3] - colors.clamp(0, 1).detach().numpy()).mean() < 0.05
     assert np.abs(found[:, 3] - surfels.opacities[visible].detach().numpy()).max() < 0.05
     size = struct.unpack("<I", file.read_bytes()[12:16])[0]

@@ -7,7 +7,7 @@ from PIL import Image
 
 import nexwarp as nw
 from nexwarp.errors import FormatError, SettingError
-from nexwarp.export.web.scene_data import SceneData
+from nexwarp.export.web.scene_file import SceneData
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model import graphs as frames
 from nexwarp.ops.tiles import Order

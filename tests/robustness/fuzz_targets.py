@@ -24,7 +24,7 @@ from nexwarp.data.images import read_image, read_mask, read_transparent
 from nexwarp.data.ply import read_ply
 from nexwarp.data.scene import SceneSource
 from nexwarp.data.sfm.photos import MAKE, MODEL, camera_groups, read_photos
-from nexwarp.export.surfels_ply import save_splats_ply
+from nexwarp.export.splats import save_splats_ply
 from nexwarp.io.json_files import write_json
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.detail_limits import DetailLimits

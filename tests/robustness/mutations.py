@@ -86,7 +86,7 @@ MUTATIONS = [
     Mutation("model/exposures.py", "log_gains.clamp(self.log_gains.amin(0), self.log_gains.amax(0)).exp()", "log_gains.exp()", "tests/model/test_exposures.py"),
     Mutation("model/options.py", 'check_range("background", value, -LARGEST_COLOR', 'check_range("background", value, 0 * LARGEST_COLOR', "tests/model -k background"),
     # 51: export and the page
-    Mutation("export/surfels_ply.py", "rest.mT.flatten(1)", "rest.flatten(1)", "tests/export/test_export.py"),
+    Mutation("export/splats.py", 'raw["shN"].mT.flatten(1)', 'raw["shN"].flatten(1)', "tests/export/test_export.py"),
     Mutation("export/splats.py", "SPACING = 1.4", "SPACING = 2.4", "tests/export/test_export.py"),
     Mutation("export/mesh.py", "vertices + origin, -normals", "vertices + origin, normals", "tests/export/test_mesh.py"),
     Mutation("export/web/quantise.py", "low, high = (logs[known].min()", "low, high = (logs.min()", "tests/export/web/test_scene_file.py"),

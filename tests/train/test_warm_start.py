@@ -10,7 +10,7 @@ import torch
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene
-from nexwarp.export.surfels_ply import save_surfels_ply
+from nexwarp.export.splats import save_surfels_ply
 from nexwarp.io.ply import write_elements
 from nexwarp.model.surfels import PARAMETERS
 from tests.cli.support import refused

@@ -13,7 +13,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera, resized
 from nexwarp.errors import FormatError
-from nexwarp.export.web.atlas import bake
+from nexwarp.export.web.baked import bake
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
 from nexwarp.io.files import write_together
 from nexwarp.io.pictures import to_uint8

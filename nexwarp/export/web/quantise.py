@@ -6,7 +6,6 @@ away costs the others no precision.
 
 import numpy as np
 
-from nexwarp.export.web.scene_data import SceneData
 from nexwarp.model.detail_limits import NEVER
 
 CHUNK = 256
@@ -16,32 +15,6 @@ SMALLEST = 1e-26
 HALF_WIDTH = 1 / np.sqrt(2)  # largest magnitude of x and y of a rotation whose w is the largest component
 TURN = np.sin(np.pi / 8)  # likewise of z, as quarter turns about z are free too
 QUAT_BITS = (11, 11, 10)
-
-
-def quantised(scene: SceneData) -> dict[str, np.ndarray]:
-    """Return the sections of the surfels by name, in the order of the file; surfels are in Morton order."""
-    order = morton_order(scene.means)
-    quats, swapped = encode_quats(scene.quats[order])
-    scales, gammas = (np.where(swapped[:, None], x[order, ::-1], x[order]) for x in (scene.scales, scene.gammas))
-    sh = scene.sh[order]
-    means, mean_ranges = encode_chunks(scene.means[order].astype(np.float64), np.uint16)
-    scale_codes, scale_ranges = encode_chunks(log_of(scales), np.uint16)
-    gamma_codes, gamma_ranges = encode_chunks(log_of(gammas), np.uint8)
-    degrees = range(round(sh.shape[1] ** 0.5))
-    bands = [_encode_band(sh[:, degree**2 : (degree + 1) ** 2]) for degree in degrees]
-    sections = {
-        "ranges": np.concatenate([mean_ranges, scale_ranges, gamma_ranges, *(band[1] for band in bands)], axis=1),
-        "means": means.T,
-        "quats": quats,
-        "scales": scale_codes.T,
-        "opacities": np.rint(scene.opacities[order].clip(0, 1) * 255).astype(np.uint8),
-        "gammas": gamma_codes.T,
-    }
-    if scene.limits is not None:
-        codes, sections["limits_scale"] = encode_limits(scene.limits[order])
-        sections["limits"] = codes.T
-    sections["sh"] = np.concatenate([band[0] for band in bands], axis=1).T
-    return sections
 
 
 def morton_order(means: np.ndarray) -> np.ndarray:
@@ -74,7 +47,7 @@ def encode_chunks(values: np.ndarray, dtype: type, size: int = CHUNK) -> tuple[n
     return np.clip(codes, 0, largest).astype(dtype), np.stack([low, steps], axis=-1)
 
 
-def _encode_band(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def encode_band(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Quantise SH coefficients (N, B, 3) of one degree to (N, 3 B) codes, with one range for all values of a chunk."""
     count, width = len(coefficients), 3 * coefficients.shape[1]
     codes, ranges = encode_chunks(coefficients.astype(np.float64).reshape(-1, 1), np.uint8, CHUNK * width)

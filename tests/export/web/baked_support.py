@@ -4,7 +4,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.export.bake.baked import Baked
+from nexwarp.export.bake import Baked
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
 from tests.reference.collect import rotations
 from tests.scenes import intrinsics, rigid

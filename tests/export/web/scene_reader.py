@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from nexwarp.export.bake.baked import Baked
-from nexwarp.export.web.atlas import encode_harmonics, encode_picture
+from nexwarp.export.bake import Baked
+from nexwarp.export.web.baked import encode_harmonics, encode_picture
 from nexwarp.export.web.quantise import CHUNK
 from nexwarp.model.detail_limits import NEVER
 from nexwarp.model.surfels import Surfels

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.export.bake.fit import bake as bake_model
-from nexwarp.export.web import atlas
+from nexwarp.export.bake import bake as bake_model
+from nexwarp.export.web import baked as baked_files
 from nexwarp.export.web.export import page_files, static_files
 from nexwarp.export.web.scene_file import SCENE_FILE
 from nexwarp.model.detail_limits import DetailLimits
@@ -64,7 +64,7 @@ def model(cameras) -> nw.Model:
 @pytest.fixture(scope="module")
 def site(model, cameras) -> Iterator[Site]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(atlas, "bake_model", functools.partial(bake_model, steps=10))
+        patch.setattr(baked_files, "bake_model", functools.partial(bake_model, steps=10))
         site = Site(page_files(model, cameras, title="Two & <three>"))
     with site:
         yield site
@@ -285,17 +285,17 @@ def inflated(content: bytes) -> bytes:
 
 def test_damaged_files_give_one_line(tab, site):
     """What scenes have in common with baked ones is tried in test_webgpu.py."""
-    good = site.files[atlas.BAKED_FILE]
+    good = site.files[baked_files.BAKED_FILE]
     picture = {"file": "../x", "width": 4, "height": 4, "scale": 1}
     damaged: list[tuple[dict[str, bytes | None], str]] = [
-        ({atlas.BAKED_FILE: good[:50]}, "the file ends before"),
-        ({atlas.BAKED_FILE: b"GIF89a" + good[6:]}, "expected NXWBAKED at the start"),
-        ({atlas.BAKED_FILE: rebuilt(good, surfels=41)}, "expected the sections that the header describes"),
-        ({atlas.BAKED_FILE: rebuilt(good, atlas=picture)}, "atlas: expected a picture's file"),
-        ({atlas.BAKED_FILE: rebuilt(good, sh_ranges=[1])}, "sh_ranges: expected three numbers"),
-        ({atlas.ATLAS_FILE: b"no picture"}, "expected a picture"),
-        ({atlas.BAKED_FILE: inflated(good)}, "expected sections that unpack to at most 134"),
-        ({atlas.BAKED_FILE: None}, "WebGPU"),  # there is no baked scene: what is missing is WebGPU
+        ({baked_files.BAKED_FILE: good[:50]}, "the file ends before"),
+        ({baked_files.BAKED_FILE: b"GIF89a" + good[6:]}, "expected NXWBAKED at the start"),
+        ({baked_files.BAKED_FILE: rebuilt(good, surfels=41)}, "expected the sections that the header describes"),
+        ({baked_files.BAKED_FILE: rebuilt(good, atlas=picture)}, "atlas: expected a picture's file"),
+        ({baked_files.BAKED_FILE: rebuilt(good, sh_ranges=[1])}, "sh_ranges: expected three numbers"),
+        ({baked_files.ATLAS_FILE: b"no picture"}, "expected a picture"),
+        ({baked_files.BAKED_FILE: inflated(good)}, "expected sections that unpack to at most 134"),
+        ({baked_files.BAKED_FILE: None}, "WebGPU"),  # there is no baked scene: what is missing is WebGPU
     ]
     for files, words in damaged:
         kept = site.files

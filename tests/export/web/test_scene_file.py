@@ -10,8 +10,7 @@ import pytest
 
 import nexwarp as nw
 from nexwarp.export.web.quantise import CHUNK, encode_chunks, encode_limits, encode_quats, morton_order
-from nexwarp.export.web.scene_data import SceneData
-from nexwarp.export.web.scene_file import encode_scene
+from nexwarp.export.web.scene_file import SceneData, encode_scene
 from nexwarp.model.detail_limits import NEVER
 from nexwarp.model.options import RenderOptions
 from tests.export.web.scene_reader import decode_chunks, decode_limits, decode_quats, read_sections, read_surfels

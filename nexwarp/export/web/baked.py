@@ -7,10 +7,9 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.export.bake.baked import Baked, encode_atlas
-from nexwarp.export.bake.fit import bake as bake_model
-from nexwarp.export.web.scene_data import SceneData, array_of
-from nexwarp.export.web.scene_file import joined_file, scene_header
+from nexwarp.export.bake import Baked
+from nexwarp.export.bake import bake as bake_model
+from nexwarp.export.web.scene_file import SceneData, array_of, joined_file, scene_header
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
 
@@ -39,9 +38,7 @@ def encode_baked(baked: Baked, cameras: Mapping[str, Camera]) -> dict[str, bytes
     arrays = {
         "means": scene.means,
         "quats": quats.clip(0, 65535).astype(np.uint16),
-        "scales": scene.scales,
-        "opacities": scene.opacities,
-        "gammas": scene.gammas,
+        **{name: getattr(scene, name) for name in ("scales", "opacities", "gammas")},
         "farthest": farthest.clip(0, LARGEST_FLOAT),
         "boxes": array_of(layout.boxes),
         "rects": layout.rects.cpu().numpy().astype(np.uint16),
@@ -71,6 +68,12 @@ def encode_harmonics(surfels: Surfels) -> tuple[np.ndarray, list[float]]:
         steps = np.rint(np.sqrt(magnitudes / ranges[-1]) * 127)
         codes[:, band] = (np.sign(values[:, band]) * steps.clip(0, 127) + 128).astype(np.uint8)
     return codes, ranges
+
+
+def encode_atlas(atlas: torch.Tensor) -> tuple[torch.Tensor, float]:
+    """Return uint8 codes of an atlas, 128 for 0, and the value that 127 steps stand for."""
+    scale = max(float(atlas.abs().amax().clamp(max=1.0)), 1e-3) if atlas.numel() else 1.0
+    return (atlas / scale * 127).round().clamp(-127, 127).add(128).to(torch.uint8), scale
 
 
 def encode_picture(atlas: torch.Tensor) -> tuple[bytes, float]:

@@ -1,6 +1,5 @@
 """The baked scene as a glTF file: one textured quad a surfel, for Blender, three.js and other programs."""
 
-import importlib.util
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,10 +10,8 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import up_direction
-from nexwarp.errors import FormatError, SettingError
-from nexwarp.export.bake.baked import Baked, mean_colors
-from nexwarp.export.bake.layout import Layout, lay_out
-from nexwarp.export.bake.observe import axes
+from nexwarp.errors import FormatError
+from nexwarp.export.bake import Baked, Layout, lay_out, points_on
 from nexwarp.io.files import write_atomically
 from nexwarp.io.pictures import to_uint8
 from nexwarp.kernels.types import ALPHA_MAX
@@ -31,10 +28,8 @@ def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camer
     """Write a baked scene as a glTF 2.0 binary file, atomically: unlit quads with one texture of colours and alpha.
 
     Colours are those at the mean exposure from the direction in which the views see each surfel. The mean of the
-    cameras' upward directions becomes +y. SettingError: trimesh, of the extra `glb`, is not installed. FormatError: no
-    surfel is opaque enough to be seen.
+    cameras' upward directions becomes +y. FormatError: no surfel is opaque enough to be seen.
     """
-    check_package()
     import trimesh
     from PIL import Image
     from trimesh.exchange.gltf import export_glb
@@ -43,30 +38,18 @@ def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camer
     if not len(layout.textured()):
         raise FormatError(f"{path}: expected surfels with an opacity above {CUTOFF}, which glTF shows; found none")
     corners, places, faces = _quads(baked, layout)
-    mesh = trimesh.Trimesh(
-        vertices=corners @ upright(cameras).T,
-        faces=faces,
-        visual=trimesh.visual.TextureVisuals(
-            uv=places,
-            material=trimesh.visual.material.PBRMaterial(
-                name="surfels",
-                baseColorTexture=Image.fromarray(pixels, "RGBA"),
-                metallicFactor=0.0,
-                roughnessFactor=1.0,
-                alphaMode="MASK",
-                alphaCutoff=CUTOFF,
-                doubleSided=True,
-            ),
-        ),
-        process=False,
+    material = trimesh.visual.material.PBRMaterial(
+        name="surfels",
+        baseColorTexture=Image.fromarray(pixels, "RGBA"),
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+        alphaMode="MASK",
+        alphaCutoff=CUTOFF,
+        doubleSided=True,
     )
+    visual = trimesh.visual.TextureVisuals(uv=places, material=material)
+    mesh = trimesh.Trimesh(vertices=corners @ upright(cameras).T, faces=faces, visual=visual, process=False)
     write_atomically(Path(path), export_glb(trimesh.Scene(mesh), tree_postprocessor=_unlit))
-
-
-def check_package() -> None:
-    """Raise SettingError unless trimesh is installed."""
-    if importlib.util.find_spec("trimesh") is None:
-        raise SettingError("--format glb: needs the package trimesh, found none; pip install 'nexwarp[glb]'")
 
 
 def upright(cameras: Sequence[Camera]) -> np.ndarray:
@@ -81,12 +64,11 @@ def _texture(baked: Baked) -> tuple[Layout, np.ndarray]:
     """Return a layout of the surfels' visible parts, and its texels (height, width, 4) uint8, RGBA."""
     surfels = baked.surfels
     opacities, gammas = surfels.opacities.clamp(max=ALPHA_MAX), surfels.gammas
-    visible = opacities > CUTOFF
     # |u|^(2 gamma) = 2 log(opacity / alpha) at the end of the quad.
     reach = (2 * (opacities / LEAST_ALPHA).clamp_min(1).log())[:, None].pow(0.5 / gammas)
-    boxes = torch.cat([-reach, reach], dim=1)
-    layout = lay_out(boxes, visible, baked.seen.pixels, fewest=FEWEST)
-    plain = mean_colors(surfels, baked.seen, baked.model.options.sh_degree)
+    boxes = torch.cat([-reach, reach], dim=1).where((opacities > CUTOFF)[:, None], 0.0)
+    layout = lay_out(boxes, baked.seen.pixels, fewest=FEWEST)
+    plain = baked.mean_colors()
     pixels = np.zeros((layout.height, layout.width, 4), np.uint8)
     for places, ids, local in layout.centres():
         colors = plain[ids] + baked.added(ids, local)
@@ -105,9 +87,7 @@ def _quads(baked: Baked, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.nda
     sides = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], device=boxes.device)
     local = boxes[:, None, :2] + sides * (boxes[:, None, 2:] - boxes[:, None, :2])
     offsets = local * surfels.scales.detach()[ids, None]
-    corners = surfels.means.detach()[ids, None] + sum(
-        offsets[..., i : i + 1] * axis[ids, None] for i, axis in enumerate(axes(surfels))
-    )
+    corners = points_on(surfels, ids[:, None], offsets)
     size = torch.tensor([layout.width, layout.height], device=boxes.device)
     places = (rects[:, None, :2] + 0.5 + sides * (rects[:, None, 2:] - 1)) / size
     places[..., 1] = 1 - places[..., 1]

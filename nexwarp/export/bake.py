@@ -1,0 +1,353 @@
+"""The neural texture baked into an image, for renderers without a hash grid and an MLP. Not in the paper.
+
+The texture is evaluated at the texels, then texels and SH are fitted to the model's own renderings.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from torch.nn.functional import grid_sample, normalize
+
+from nexwarp import ops
+from nexwarp.cameras.camera import Camera
+from nexwarp.errors import FormatError
+from nexwarp.kernels.types import MAX_HITS
+from nexwarp.model.model import Model
+from nexwarp.model.render import Rendering
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NeuralTexture
+
+# Hits below this blending weight do not decide where a surfel has a texture: of 255 grey levels they change 4 at most.
+LEAST_WEIGHT = 1.0 / 64.0
+NOWHERE = 1e30
+TINY_WEIGHT = 1e-3  # hits below it keep their plain colours
+
+MAX_SIDE = 256  # texels of one surfel along one axis
+FILLED = 0.85  # fraction of the atlas that rectangles cover at most: packing leaves gaps
+BISECTIONS = 24
+TEXELS_AT_A_TIME = 2**20
+LARGEST_TEXEL = 1e6  # pixels
+GROWTH = 1.2
+
+WINDOW = 256  # largest width and height that one step renders
+PASSES = 2.0  # over the views' pixels
+FEWEST_STEPS, MOST_STEPS = 70, 800
+RATES = {"atlas": 0.02, "sh0": 5e-3, "shN": 2e-3}
+LAST_RATE = 0.1  # relative to the first
+
+
+@dataclass(frozen=True)
+class ViewHits:
+    """The heaviest hits of each pixel of one view, at most 8 a pixel; P hits in all."""
+
+    rendering: Rendering  # without texture
+    slots: torch.Tensor  # (P,) int64, places in (H, W, 8) buffers; the first of a pixel has the largest weight
+    ids: torch.Tensor  # (P,) int64, surfels
+    weights: torch.Tensor  # (P,) blending weights
+    depths: torch.Tensor  # (P,) z-depths, world units
+    local: torch.Tensor  # (P, 2) coordinates of the hits on their surfels, in units of the scales
+    directions: torch.Tensor  # (P, 3) unit directions of the rays, world frame
+
+    def plain_colors(self) -> torch.Tensor:
+        """Return the hits' plain colours (P, 3)."""
+        return self.rendering.intermediates.projection.records[self.ids, 3, :3]
+
+    def blended(self, colors: torch.Tensor) -> torch.Tensor:
+        """Return the sums (H, W, 3) over each pixel's hits of weight * colors (P, 3); differentiable."""
+        height, width = self.rendering.alpha.shape
+        sums = colors.new_zeros(height * width, 3)
+        return sums.index_add(0, self.slots // MAX_HITS, self.weights[:, None] * colors).view(height, width, 3)
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What a set of views sees of N surfels."""
+
+    # (N, 4) u0, v0, u1, v1, in units of the scales: the box of all textured hits of some weight; u0 > u1 without any
+    boxes: torch.Tensor
+    pixels: torch.Tensor  # (N, 2) largest number of pixels that one scale covers along the surfel's x and y axes
+    textured: torch.Tensor  # (N,) fraction of the surfel's blending weight that is textured
+    directions: torch.Tensor  # (N, 3) mean direction from which it is seen, unit, world frame; 0 if no view sees it
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Rectangles of N surfels in an atlas of `width` x `height` texels.
+
+    The centres of a rectangle's outer texels lie on the sides of the surfel's box. Beyond its box a surfel has the
+    colours of the box's side: samplers clamp the coordinates, and bilinear sampling never reads a neighbour's texel.
+    """
+
+    rects: torch.Tensor  # (N, 4) int32 left, top, width, height; the one texel at (0, 0) for surfels without a texture
+    boxes: torch.Tensor  # (N, 4) u0, v0, u1, v1, in units of the scales; 0, 0, 0, 0 for surfels without a texture
+    width: int
+    height: int
+
+    def textured(self) -> torch.Tensor:
+        """Return the surfels (T,) int64 that have a texture."""
+        return (self.boxes[:, 2] > self.boxes[:, 0]).nonzero()[:, 0]
+
+    def texels(self, ids: torch.Tensor, local: torch.Tensor) -> torch.Tensor:
+        """Return places (..., 2) in the atlas, column and row, of coordinates (..., 2) on surfels (...).
+
+        Whole numbers are centres of texels; the coordinates are in units of the scales.
+        """
+        boxes, rects = self.boxes[ids], self.rects[ids].to(local)
+        share = (local - boxes[..., :2]) / (boxes[..., 2:] - boxes[..., :2]).clamp_min(1e-12)
+        return rects[..., :2] + share.clamp(0, 1) * (rects[..., 2:] - 1)
+
+    def centres(self) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+        """Yield the texels, about a million at a time, as an atlas has up to 16 million.
+
+        Places (M, 2) int64, column and row; surfels (M,) int64; coordinates (M, 2) on them.
+        """
+        textured = self.textured()
+        part = self.rects[textured, 2:].long().prod(1).cumsum(0) // TEXELS_AT_A_TIME
+        for members in textured.split(part.unique_consecutive(return_counts=True)[1].tolist()):
+            counts = self.rects[members, 2:].long().prod(1)
+            ids = members.repeat_interleave(counts)
+            rects, boxes = self.rects[ids].long(), self.boxes[ids]
+            index = torch.arange(len(ids), device=ids.device) - (counts.cumsum(0) - counts).repeat_interleave(counts)
+            inside = torch.stack([index % rects[:, 2], index // rects[:, 2]], dim=1)
+            share = inside / (rects[:, 2:] - 1).clamp_min(1)
+            yield rects[:, :2] + inside, ids, boxes[:, :2] + share * (boxes[:, 2:] - boxes[:, :2])
+
+
+@dataclass(frozen=True)
+class Baked:
+    """Surfels whose colour at a point is their plain colour plus a texel of the atlas, for all hits of a pixel."""
+
+    model: Model  # that was baked
+    surfels: Surfels  # its surfels, with SH that take over the texture's dependence on the direction
+    seen: Observations  # what the views see of the surfels
+    layout: Layout  # the surfels' texels in the atlas
+    atlas: torch.Tensor  # (height, width, 3) float32, added to the plain colours, sRGB
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> torch.Tensor:
+        """Return the image (H, W, 3) of a camera at the mean exposure.
+
+        Of each pixel, the 8 heaviest hits have their texels; further hits have their plain colours.
+        """
+        hits = hits_of(untextured(self.model, self.surfels), camera)
+        plain = hits.plain_colors()
+        return hits.rendering.image + hits.blended(torch.maximum(self.added(hits.ids, hits.local), -plain))
+
+    def added(self, ids: torch.Tensor, local: torch.Tensor) -> torch.Tensor:
+        """Return what the atlas adds (..., 3) to the colours of surfels (...) at coordinates (..., 2) on them."""
+        return sample(self.atlas, self.layout.texels(ids, local))
+
+    def mean_colors(self) -> torch.Tensor:
+        """Return the plain colours (N, 3) of the surfels from the mean directions that the views see them in."""
+        surfels, degree = self.surfels, self.model.options.sh_degree
+        return ops.plain_colors((surfels.sh0, surfels.shN), self.seen.directions, surfels.means.new_zeros(3), degree)
+
+
+def bake(model: Model, cameras: Sequence[Camera], *, steps: int | None = None) -> Baked:
+    """Bake a model's texture into an atlas whose texels are about a pixel of the closest of the given views.
+
+    The number of steps of the fit follows from that of the views' pixels unless it is given.
+    """
+    if steps is None:
+        windows = sum(camera.width * camera.height for camera in cameras) / WINDOW**2
+        steps = min(max(round(PASSES * windows), FEWEST_STEPS), MOST_STEPS)
+    seen = observe(model, cameras)
+    return fit(evaluate(model, seen, lay_out(seen.boxes, seen.pixels)), cameras, steps)
+
+
+def axes(surfels: Surfels) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the surfels' unit x and y axes, (N, 3) each, world frame."""
+    w, x, y, z = surfels.quats.detach().unbind(-1)
+    across = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
+    along = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1)
+    return across, along
+
+
+def points_on(surfels: Surfels, ids: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
+    """Return points (..., 3), world frame, at offsets (..., 2) [world units] along the axes of surfels (...)."""
+    ways = zip(offsets.unbind(-1), axes(surfels), strict=True)
+    return surfels.means.detach()[ids] + sum(x[..., None] * axis[ids] for x, axis in ways)
+
+
+def untextured(model: Model, surfels: Surfels | None = None) -> Model:
+    """Return a model that keeps 8 hits a pixel, without texture, at the mean exposure, with other colours if given."""
+    options = model.options.changed(max_hits=MAX_HITS, exposure="mean", clamp_texture=False)
+    return Model(surfels or model.surfels, None, None, model.detail_limits, options, model.meta)
+
+
+@torch.no_grad()
+def hits_of(bare: Model, camera: Camera) -> ViewHits:
+    """Render a view of an `untextured` model and locate its hits on their surfels."""
+    camera = camera.to(bare.device)
+    rendering = bare.render(camera)
+    surfels = bare.surfels
+    slots = (rendering.weights >= TINY_WEIGHT).flatten().nonzero()[:, 0]
+    pixels = slots // MAX_HITS
+    ids, weights, depths = (x.flatten()[slots] for x in (rendering.ids, rendering.weights, rendering.depths))
+    ids = ids.long()
+    x = (pixels % camera.width + 0.5 - camera.cx) / camera.fx
+    y = (pixels // camera.width + 0.5 - camera.cy) / camera.fy
+    rays = torch.stack([x, y, torch.ones_like(weights)], dim=1) @ camera.viewmat[:3, :3].to(weights)
+    offsets = camera.position.to(weights) + depths[:, None] * rays - surfels.means.detach()[ids]
+    coordinates = [(offsets * axis[ids]).sum(1) for axis in axes(surfels)]
+    local = torch.stack(coordinates, dim=1) / surfels.scales.detach()[ids]
+    return ViewHits(rendering, slots, ids, weights, depths, local, normalize(rays, dim=1))
+
+
+@torch.no_grad()
+def observe(model: Model, cameras: Sequence[Camera]) -> Observations:
+    """Render all views without texture and gather what they see of each surfel; K decides which hits are textured."""
+    bare, kept = untextured(model), model.options.max_hits
+    count, means = len(model.surfels), model.surfels.means.detach()
+    boxes = means.new_tensor([NOWHERE, NOWHERE, -NOWHERE, -NOWHERE]).repeat(count, 1)
+    pixels, total, textured = means.new_zeros(count, 2), means.new_zeros(count), means.new_zeros(count)
+    directions, scales, sides = means.new_zeros(count, 3), model.surfels.scales.detach(), axes(model.surfels)
+    for camera in cameras:
+        hits = hits_of(bare, camera)
+        total.index_add_(0, hits.ids, hits.weights)
+        directions.index_add_(0, hits.ids, hits.weights[:, None] * hits.directions)
+        heavy = hits.slots % MAX_HITS < kept
+        textured.index_add_(0, hits.ids, hits.weights * heavy)
+        heavy &= hits.weights >= LEAST_WEIGHT
+        ids, local, rays = hits.ids[heavy], hits.local[heavy], hits.directions[heavy]
+        pairs = ids[:, None].expand(-1, 2)
+        for side, how in ((0, "amin"), (2, "amax")):
+            boxes[:, side : side + 2].scatter_reduce_(0, pairs, local, how)
+        # Pixels that one scale covers: its part across the ray, over the size of a pixel at the hit.
+        cosines = torch.stack([(axis[ids] * rays).sum(1) for axis in sides], dim=1)
+        sizes = hits.depths[heavy] / camera.focal
+        covered = scales[ids] * (1 - cosines.square()).clamp_min(0).sqrt() / sizes[:, None]
+        pixels.scatter_reduce_(0, pairs, covered, "amax")
+    return Observations(boxes, pixels, textured / total.clamp_min(1e-12), normalize(directions, dim=-1))
+
+
+def lay_out(
+    boxes: torch.Tensor, pixels: torch.Tensor, *, texel: float = 1.0, side: int = 4096, fewest: int = 2
+) -> Layout:
+    """Give each surfel with a box (N, 4) of u1 > u0, in units of the scales, a rectangle.
+
+    One scale covers `pixels` (N, 2) along either axis. `texel`, the size of a texel in pixels, grows until the atlas of
+    at most `side` texels a side holds all of them. A surfel has `fewest` texels along an axis where there is room.
+    """
+    textured = boxes[:, 2] > boxes[:, 0]
+    boxes = boxes.where(textured[:, None], 0.0)
+    covered = ((boxes[:, 2:] - boxes[:, :2]) * pixels)[textured].double().cpu()
+    room = FILLED * side * side
+    fewest = max(min(fewest, int(math.sqrt(room / max(len(covered), 1)))), 2)
+
+    def sizes_at(step: float) -> tuple[torch.Tensor, int]:
+        sizes = ((covered / step).ceil() + 1).clamp(fewest, MAX_SIDE).int()
+        return sizes, int(sizes.long().prod(1).sum())
+
+    low = high = texel
+    while sizes_at(high)[1] > room and high < LARGEST_TEXEL:
+        high *= 2
+    for _ in range(BISECTIONS if high > low else 0):
+        middle = math.sqrt(low * high)
+        if sizes_at(middle)[1] > room:
+            low = middle
+        else:
+            high = middle
+    while True:
+        sizes, area = sizes_at(high)
+        width = min(side, max(64, 2 ** math.ceil(math.log2(math.sqrt(max(area, 1) / FILLED)))))
+        places, height = _pack(sizes, width)
+        if height <= side and (not len(sizes) or int(sizes[:, 0].max()) <= width):
+            break
+        if high > LARGEST_TEXEL:
+            raise ValueError(f"side: expected a larger atlas than {side} for {len(sizes):,} surfels")
+        high *= GROWTH  # the shelves leave more gaps than FILLED allows for
+    rects = torch.tensor([0, 0, 1, 1], dtype=torch.int32).repeat(len(boxes), 1)
+    rects[textured.cpu()] = torch.cat([places, sizes], dim=1)
+    return Layout(rects.to(boxes.device), boxes, width, height)
+
+
+def _pack(sizes: torch.Tensor, width: int) -> tuple[torch.Tensor, int]:
+    """Place rectangles (M, 2) on shelves, tallest first, below a first row that holds the texel of untextured surfels.
+
+    Returns left and top (M, 2) int32, and the height of the atlas, a multiple of 4.
+    """
+    order = torch.argsort(sizes[:, 1], descending=True, stable=True)
+    places: list[tuple[int, int]] = []
+    left, top, tallest = 0, 1, 0
+    for across, along in sizes[order].tolist():
+        if left + across > width:
+            left, top, tallest = 0, top + tallest, 0
+        places.append((left, top))
+        left, tallest = left + across, max(tallest, along)
+    packed = torch.empty_like(sizes)
+    packed[order] = torch.tensor(places, dtype=torch.int32).reshape(-1, 2)
+    return packed, -(-(top + tallest) // 4) * 4
+
+
+def sample(atlas: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Interpolate an atlas (height, width, C) bilinearly at places (..., 2), column and row; differentiable."""
+    size = atlas.new_tensor([atlas.shape[1], atlas.shape[0]])
+    grid = ((2 * places + 1) / size - 1).reshape(1, -1, 1, 2)
+    values = grid_sample(atlas.permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border")
+    return values[0, :, :, 0].T.reshape(*places.shape[:-1], atlas.shape[2])
+
+
+@torch.no_grad()
+def evaluate(model: Model, seen: Observations, layout: Layout) -> Baked:
+    """Bake the texture at the texels of a layout, seen from the surfels' mean directions.
+
+    What is added to a plain colour is weighted by the fraction of the surfel that is textured.
+    """
+    surfels, texture, options = model.surfels, model.texture, model.options
+    atlas = surfels.means.new_zeros(layout.height, layout.width, 3)
+    baked = Baked(model, surfels, seen, layout, atlas)
+    if texture is None or options.max_hits == 0:
+        return baked
+    if not isinstance(texture, NeuralTexture):
+        raise FormatError(f"texture: expected a nexwarp.NeuralTexture to bake, got {type(texture).__name__}")
+    plain = torch.zeros_like(surfels.means) if texture.residual else baked.mean_colors()
+    # A pixel of the closest view, in world units: levels of finer cells fade as they do there.
+    sizes = (surfels.scales / seen.pixels.clamp_min(1e-12)).amin(1)
+    colors_at = partial(texture.evaluate, focal=1.0, sh_degree=options.sh_degree, clamp=options.clamp_texture)
+    for places, ids, local in layout.centres():
+        points = points_on(surfels, ids, local * surfels.scales[ids])
+        colors = colors_at(points[:, None], sizes[ids, None], seen.directions[ids])[:, 0]
+        atlas[places[:, 1], places[:, 0]] = seen.textured[ids, None] * (colors - plain[ids])
+    return baked
+
+
+def fit(baked: Baked, cameras: Sequence[Camera], steps: int) -> Baked:
+    """Fit atlas and SH to the model's renderings by least squares: Adam, a window of one view a step."""
+    model, degree = baked.model, baked.model.options.sh_degree
+    state = {name: x.detach().clone() for name, x in baked.surfels.state_dict().items()}
+    trained = {"atlas": baked.atlas.clone(), "sh0": state["sh0"], "shN": state["shN"]}
+    groups = [{"params": [x.requires_grad_()], "lr": RATES[name]} for name, x in trained.items()]
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, LAST_RATE ** (1 / max(steps, 1)))
+    bare = untextured(model)
+    order = torch.Generator().manual_seed(0)
+    views: list[int] = []
+    for _ in range(steps):
+        views = views or torch.randperm(len(cameras), generator=order).tolist()
+        camera = _window(cameras[views.pop()].to(model.device), order)
+        target = model.render_image(camera, exposure="mean")
+        hits = hits_of(bare, camera)
+        plain = ops.plain_colors((trained["sh0"], trained["shN"]), state["means"], camera.position.to(target), degree)
+        added = sample(trained["atlas"], baked.layout.texels(hits.ids, hits.local))
+        colors = (plain.index_select(0, hits.ids) + added).clamp_min(0)
+        with torch.no_grad():  # further hits in their plain colours, and the background
+            others = hits.rendering.image - hits.blended(hits.plain_colors())
+        loss = (others + hits.blended(colors) - target).square().mean()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    state |= {name: trained[name].detach() for name in ("sh0", "shN")}
+    return replace(baked, surfels=Surfels(state), atlas=trained["atlas"].detach())
+
+
+def _window(camera: Camera, generator: torch.Generator) -> Camera:
+    """Return the camera of a random window of an image."""
+    width, height = min(camera.width, WINDOW), min(camera.height, WINDOW)
+    left = int(torch.randint(camera.width - width + 1, (1,), generator=generator))
+    top = int(torch.randint(camera.height - height + 1, (1,), generator=generator))
+    return camera.crop(left, top, width, height)
