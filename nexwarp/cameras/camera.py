@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ LARGEST_DISTANCE = 1e16  # of a camera from the origin, world units: its square 
 SMALLEST_FOCAL = 1e-16  # pixels
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class Camera:
     """A pinhole camera.
 
@@ -60,46 +60,24 @@ class Camera:
     cx: float = field(init=False)
     cy: float = field(init=False)
 
-    if TYPE_CHECKING:  # the constructor takes arrays, the fields are tensors
-
-        def __init__(
-            self,
-            viewmat: Array,
-            K: Array,
-            width: int,
-            height: int,
-            near: float = 0.01,
-            *,
-            origin: tuple[float, float, float] | None = None,
-            checked: tuple[float, float, float, float] | None = None,
-        ) -> None: ...
-
-    def __post_init__(self, checked: tuple[float, float, float, float] | None) -> None:
+    def __init__(
+        self,
+        viewmat: Array,
+        K: Array,
+        width: int,
+        height: int,
+        near: float = 0.01,
+        *,
+        origin: tuple[float, float, float] | None = None,
+        checked: tuple[float, float, float, float] | None = None,
+    ) -> None:
         if checked is None:
-            object.__setattr__(self, "viewmat", _as_tensor("viewmat", self.viewmat, None))
-            object.__setattr__(self, "K", _as_tensor("K", self.K, self.viewmat.device))
-        numbers = self._check() if checked is None else checked
-        for name, value in zip(("fx", "fy", "cx", "cy"), numbers, strict=True):
-            object.__setattr__(self, name, value)
-
-    def _check(self) -> tuple[float, float, float, float]:
-        """Return fx, fy, cx and cy; raise TypeError or ValueError where a field does not fit."""
-        viewmat, intrinsics = _matrix("viewmat", self.viewmat, 4), _matrix("K", self.K, 3)
-        if self.K.device != self.viewmat.device:
-            raise ValueError(f"K: expected a tensor on {self.viewmat.device} as viewmat is, got one on {self.K.device}")
-        for name in ("width", "height"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
-            if value < 1:
-                raise ValueError(f"{name}: expected at least 1, got {value}")
-        if isinstance(self.near, bool) or not isinstance(self.near, (int, float)):
-            raise TypeError(f"near: expected a number, got {type(self.near).__name__}")
-        check_range("near", self.near, 0, LARGEST_DISTANCE)
-        _check_rigid(viewmat)
-        _check_intrinsics(intrinsics)
-        (fx, _, cx), (_, fy, cy), _ = intrinsics.tolist()
-        return fx, fy, cx, cy
+            viewmat = _as_tensor("viewmat", viewmat, None)
+            K = _as_tensor("K", K, viewmat.device)
+            checked = _check(viewmat, K, {"width": width, "height": height}, near)
+        fx, fy, cx, cy = checked
+        vars(self).update(viewmat=viewmat, K=K, width=width, height=height, near=near, origin=origin)
+        vars(self).update(fx=fx, fy=fy, cx=cx, cy=cy)
 
     @property
     def focal(self) -> float:
@@ -109,7 +87,7 @@ class Camera:
     @property
     def pixel_focal(self) -> float:
         """Focal length of the image's pixels: `focal` may be lower, to limit the detail of the texture."""
-        return (self.fx * self.fy) ** 0.5
+        return self.focal
 
     @property
     def device(self) -> torch.device:
@@ -157,27 +135,23 @@ class Camera:
         return replace(self, viewmat=moved, origin=origin, checked=(self.fx, self.fy, self.cx, self.cy))
 
 
-@dataclass(frozen=True)
 class StagedCamera(Camera):
     """A camera whose tensors are overwritten in place, so that a recorded CUDA graph renders what other cameras see.
 
+    It has the size, near depth and dtype of `camera`, and zeros for numbers until `copy_`.
+
     Attributes:
-        numbers: (30,) viewmat, K, `focal`, `pixel_focal` and a background colour of the camera that was copied last:
-            one copy brings them all. `fx` to `cy` are those of the first camera.
+        numbers: (29,) viewmat, K, `focal` and a background colour of the camera that was copied last: one copy brings
+            them all. `fx` to `cy` are those of the first camera.
         falloff: (H, W, 1) falloff of the lens for that camera; None where the lens has none, or is not rendered.
     """
 
-    numbers: torch.Tensor = field(kw_only=True)
-    falloff: torch.Tensor | None = field(default=None, kw_only=True)
-
-    @classmethod
-    def like(cls, camera: Camera, device: torch.device, falloff: torch.Tensor | None = None) -> "StagedCamera":
-        """Return a camera of the same size, near depth and dtype, with zeros for numbers until `copy_`."""
-        numbers = torch.zeros(30, dtype=camera.viewmat.dtype, device=device)
-        matrices = (numbers[:16].view(4, 4), numbers[16:25].view(3, 3))
+    def __init__(self, camera: Camera, device: torch.device, falloff: torch.Tensor | None = None) -> None:
+        self.numbers = torch.zeros(29, dtype=camera.viewmat.dtype, device=device)
+        self.falloff = falloff
+        viewmat, K = self.numbers[:16].view(4, 4), self.numbers[16:25].view(3, 3)
         checked = (camera.fx, camera.fy, camera.cx, camera.cy)
-        width, height, near = camera.width, camera.height, camera.near
-        return cls(*matrices, width, height, near, checked=checked, numbers=numbers, falloff=falloff)
+        super().__init__(viewmat, K, camera.width, camera.height, camera.near, checked=checked)
 
     @property
     def focal(self) -> torch.Tensor:  # type: ignore[override]  # a graph reads the number from the device
@@ -185,20 +159,15 @@ class StagedCamera(Camera):
         return self.numbers[25:26]
 
     @property
-    def pixel_focal(self) -> torch.Tensor:  # type: ignore[override]
-        """(1,) focal length of the image's pixels, on the device."""
-        return self.numbers[26:27]
-
-    @property
     def color(self) -> torch.Tensor:
         """(3,) background colour, on the device."""
-        return self.numbers[27:]
+        return self.numbers[26:]
 
     def copy_(self, camera: Camera, color: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         """Overwrite all but the falloff with another camera of the same size and near depth, and a background."""
         dtype = self.numbers.dtype
         # From pageable memory, which is read before the copy returns.
-        scalars = torch.tensor([camera.focal, camera.pixel_focal, *color], dtype=dtype)
+        scalars = torch.tensor([camera.focal, *color], dtype=dtype)
         matrices = [camera.viewmat.detach().reshape(-1), camera.K.detach().to(dtype).reshape(-1)]
         if camera.device.type == "cpu":
             self.numbers.copy_(torch.cat([*matrices, scalars]), non_blocking=True)
@@ -232,30 +201,43 @@ def _matrix(name: str, tensor: torch.Tensor, size: int) -> torch.Tensor:
     return matrix
 
 
-def _check_rigid(viewmat: torch.Tensor) -> None:
-    rotation = viewmat[:3, :3]
-    error = (rotation.T @ rotation - torch.eye(3, dtype=viewmat.dtype)).abs().max().item()
-    if error > ROTATION_TOLERANCE:
-        raise ValueError(
-            f"viewmat: expected an orthonormal rotation (max |R^T R - 1| <= {ROTATION_TOLERANCE:g}), got {error:.3g}"
-        )
-    if torch.linalg.det(rotation) < 0:
-        raise ValueError("viewmat: expected a rotation with determinant 1, got a mirroring one (determinant < 0)")
-    if (viewmat[3] - torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=viewmat.dtype)).abs().max() > ROTATION_TOLERANCE:
-        raise ValueError(f"viewmat: expected the last row (0, 0, 0, 1), got {tuple(viewmat[3].tolist())}")
-    if viewmat[:3, 3].abs().max() > LARGEST_DISTANCE:
-        moved = tuple(viewmat[:3, 3].tolist())
-        raise ValueError(f"viewmat: expected a translation of at most {LARGEST_DISTANCE:g}, got {moved}")
-
-
-def _check_intrinsics(intrinsics: torch.Tensor) -> None:
-    (fx, skew, _), (shear, fy, _), last = intrinsics.tolist()
-    if not min(fx, fy) >= SMALLEST_FOCAL:
-        raise ValueError(f"K: expected focal lengths > 0, at least {SMALLEST_FOCAL:g}, got fx={fx:g}, fy={fy:g}")
-    if skew != 0 or shear != 0:
-        raise ValueError(f"K: expected no skew, got K[0, 1]={skew:g}, K[1, 0]={shear:g}")
-    if last != [0.0, 0.0, 1.0]:
-        raise ValueError(f"K: expected the last row (0, 0, 1), got {tuple(last)}")
+def _check(
+    viewmat: torch.Tensor, K: torch.Tensor, sides: dict[str, int], near: float
+) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx and cy; raise TypeError or ValueError where a field of a camera does not fit."""
+    pose, intrinsics = _matrix("viewmat", viewmat, 4), _matrix("K", K, 3)
+    if K.device != viewmat.device:
+        raise ValueError(f"K: expected a tensor on {viewmat.device} as viewmat is, got one on {K.device}")
+    for name, value in sides.items():
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+        check_range(name, value, 1)
+    if isinstance(near, bool) or not isinstance(near, (int, float)):
+        raise TypeError(f"near: expected a number, got {type(near).__name__}")
+    check_range("near", near, 0, LARGEST_DISTANCE)
+    rotation, moved = pose[:3, :3], pose[:3, 3]
+    error = (rotation.T @ rotation - torch.eye(3, dtype=pose.dtype)).abs().max().item()
+    last_row = (pose[3] - pose.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max()
+    (fx, skew, cx), (shear, fy, cy), last = intrinsics.tolist()
+    orthonormal = f"an orthonormal rotation (max |R^T R - 1| <= {ROTATION_TOLERANCE:g})"
+    proper, mirroring = "a rotation with determinant 1", "a mirroring one (determinant < 0)"
+    lengths = f"focal lengths > 0, at least {SMALLEST_FOCAL:g}"
+    checks = [
+        (error <= ROTATION_TOLERANCE, f"viewmat: expected {orthonormal}, got {error:.3g}"),
+        (torch.linalg.det(rotation) >= 0, f"viewmat: expected {proper}, got {mirroring}"),
+        (last_row <= ROTATION_TOLERANCE, f"viewmat: expected the last row (0, 0, 0, 1), got {(*pose[3].tolist(),)}"),
+        (
+            moved.abs().max() <= LARGEST_DISTANCE,
+            f"viewmat: expected a translation of at most {LARGEST_DISTANCE:g}, got {(*moved.tolist(),)}",
+        ),
+        (min(fx, fy) >= SMALLEST_FOCAL, f"K: expected {lengths}, got fx={fx:g}, fy={fy:g}"),
+        (skew == shear == 0, f"K: expected no skew, got K[0, 1]={skew:g}, K[1, 0]={shear:g}"),
+        (last == [0.0, 0.0, 1.0], f"K: expected the last row (0, 0, 1), got {tuple(last)}"),
+    ]
+    for fits, message in checks:
+        if not fits:
+            raise ValueError(message)
+    return fx, fy, cx, cy
 
 
 def in_image(pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int) -> torch.Tensor:

@@ -286,7 +286,7 @@ class CapturedFrame:
         exposures = frame.exposures if frame.options.exposure == "photos" else None
         falloff = None if exposures is None else exposures.falloff_of(frame.camera)
         self.lens: Hashable = None
-        self.camera = StagedCamera.like(frame.camera, device, None if falloff is None else falloff.clone())
+        self.camera = StagedCamera(frame.camera, device, None if falloff is None else falloff.clone())
         self.staged = [x for x in (self.camera.numbers, self.camera.falloff) if x is not None]
         if graphs.pool is None:
             graphs.pool = torch.cuda.graph_pool_handle()
@@ -585,7 +585,7 @@ class _Stage:
     def __init__(self, target: Any) -> None:
         tensors = {field.name: getattr(target, field.name) for field in dataclasses.fields(target)}
         self.tensors = {name: x.clone() for name, x in tensors.items() if isinstance(x, torch.Tensor)}
-        self.camera = StagedCamera.like(target.camera, target.camera.device)
+        self.camera = StagedCamera(target.camera, target.camera.device)
         self.camera.copy_(target.camera)
         self.target = dataclasses.replace(target, camera=self.camera, **self.tensors)
         self.seen = 0

@@ -75,7 +75,7 @@ def test_a_staged_camera_renders_what_its_camera_does(device: torch.device) -> N
     model = finished(device)
     exposures = present(model.exposures)
     first, *others = cameras(device)
-    staged = StagedCamera.like(first, device, present(exposures.falloff_of(first)).clone())
+    staged = StagedCamera(first, device, present(exposures.falloff_of(first)).clone())
     for camera in others:
         staged.copy_(camera)
         present(staged.falloff).copy_(present(exposures.falloff_of(camera)))

@@ -164,7 +164,7 @@ def joined_file(
         packed = content if name == "poster" else zlib.compress(content, 9)
         compressed = len(packed) < 0.98 * len(content)
         stored = packed if compressed else content
-        entry = {"name": name, "dtype": DTYPES[array.dtype.str[1:]], "shape": list(array.shape)}
+        entry: dict[str, object] = {"name": name, "dtype": DTYPES[array.dtype.str[1:]], "shape": list(array.shape)}
         entry |= {"encoding": "deflate" if compressed else "raw", "offset": position, "bytes": len(stored)}
         entries.append(entry)
         parts.append(stored + bytes(-len(stored) % ALIGNMENT))
