@@ -165,9 +165,9 @@ def load_camera_path(
     """
     path = Path(path)
     data = _read(path)
+    if "camera_path" not in data and "frames" in data:
+        return CameraPath(list(_frames(path, data, near, origin).values()), None)
     if "camera_path" not in data:
-        if "frames" in data:
-            return CameraPath(list(_frames(path, data, near, origin).values()), None)
         keys = ", ".join(sorted(data)[:8]) or "none"
         raise FormatError(f"{path}: expected the key camera_path or frames, found {one_line(keys)}")
     if data.get("camera_type", "perspective") != "perspective":
@@ -201,8 +201,7 @@ def _frames(path: Path, data: JsonObject, near: float, origin: tuple[float, floa
         where = f"{path}: frames[{i}]"
         pose = matrix_of(where, frame, "transform_matrix")
         pose[:3, 3] /= scale
-        values = merged(frame, data)
-        width, height = (_size(where, values, key) for key in ("w", "h"))
+        width, height = (_size(where, merged(frame, data), key) for key in ("w", "h"))
         intrinsics = intrinsics_of(where, frame, data, width, height)
         name = one_line(frame.get("file_path", f"{i:04d}"))
         if name in cameras:
@@ -307,10 +306,9 @@ def number_of(
 
 def _size(where: str | Path, values: Mapping[str, Json], key: str) -> int:
     size = number_of(where, values, key, above=0.0)
-    if size > MAX_SIDE:
-        raise ValueError(f"{where}: {key}: expected at most {MAX_SIDE} pixels, got {size:g}")
-    if size != int(size):
-        raise ValueError(f"{where}: {key}: expected a whole number of pixels, got {size:g}")
+    if size > MAX_SIDE or size != int(size):
+        expected = f"at most {MAX_SIDE}" if size > MAX_SIDE else "a whole number of"
+        raise ValueError(f"{where}: {key}: expected {expected} pixels, got {size:g}")
     return int(size)
 
 
@@ -324,12 +322,11 @@ def matrix_of(where: str, values: Mapping[str, Json], key: str) -> torch.Tensor:
         matrix = torch.empty(0)
     if tuple(matrix.shape) not in ((16,), (12,), (4, 4), (3, 4)):
         raise ValueError(f"{where}: {key}: expected a 4x4 matrix of numbers, got {one_line(values[key], 60)}")
-    matrix = matrix.reshape(-1, 4)
-    if len(matrix) == 3:
-        matrix = torch.cat([matrix, matrix.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+    last = matrix.new_tensor([0.0, 0.0, 0.0, 1.0])
+    matrix = torch.cat([matrix.flatten(), last])[:16].reshape(4, 4)
     if not bool((matrix.abs() <= LARGEST).all()):
         raise ValueError(f"{where}: {key}: expected finite numbers of at most {LARGEST:g}, got {matrix.tolist()}")
-    if (matrix[3] - matrix.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max() > LAST_ROW:
+    if (matrix[3] - last).abs().max() > LAST_ROW:
         raise ValueError(f"{where}: {key}: expected the last row 0, 0, 0, 1, got {matrix[3].tolist()}")
     if torch.linalg.det(matrix[:3, :3]).abs() <= SINGULAR:
         raise ValueError(f"{where}: {key}: expected an invertible pose, got the singular matrix {matrix.tolist()}")

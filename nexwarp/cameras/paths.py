@@ -46,12 +46,19 @@ def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     target, up = focus(cameras), up_direction(cameras)
     if (centres - centres.mean(0)).norm(dim=1).max() <= DEGENERATE * (centres - target).norm(dim=1).max():
         raise ValueError(f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place")
-    centre, axes, semi = _fit_ellipse(viewmats, centres)
+    mean = centres.mean(0)
+    axes = torch.linalg.svd(centres - mean)[2][:2]
+    # The signs of the axes are arbitrary. The cameras' mean down direction, or forward direction for a vertical plane,
+    # decides the sense of rotation. The signs have no other effect, as the path starts at the first camera.
+    normal = torch.linalg.cross(axes[0], axes[1])
+    if max((viewmats[:, 1:3, :3].mean(0) @ normal).tolist(), key=abs) > 0.0:
+        axes = axes * axes.new_tensor([[1.0], [-1.0]])
+    low, high = torch.quantile((centres - mean) @ axes.T, axes.new_tensor([0.05, 0.95]), dim=0)
+    centre, semi = mean + (low + high) / 2.0 @ axes, (high - low) / 2.0
     x, y = ((axes @ (centres[0] - centre)) / semi.clamp(min=DEGENERATE * semi.max().item())).tolist()
     angles = math.atan2(y, x) + torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
     offsets = torch.stack([torch.cos(angles), torch.sin(angles)], dim=1) * semi @ axes
-    first = cameras[0]
-    return [replace(first, viewmat=look_at(centre + offset, target, up).to(first.viewmat)) for offset in offsets]
+    return [_looking(cameras[0], centre + offset, target, up) for offset in offsets]
 
 
 def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[Camera]:
@@ -82,12 +89,8 @@ def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[
     target, share = focus_ahead(cameras)
     angles = torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
     rounds = torch.stack([torch.cos(turns * angles), torch.sin(turns * angles), torch.sin(angles)], dim=1)
-    first = cameras[0]
-    path: list[Camera] = []
-    for position in centre + rounds * radii @ axes:
-        viewmat = look_at(position, target if share == 1.0 else position + forward, up)
-        path.append(replace(first, viewmat=viewmat.to(first.viewmat)))
-    return path
+    places = centre + rounds * radii @ axes
+    return [_looking(cameras[0], place, target if share == 1.0 else place + forward, up) for place in places]
 
 
 def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = None) -> list[Camera]:
@@ -165,14 +168,10 @@ def surrounding(points: torch.Tensor, near: float, count: int = 12) -> list[Came
     up = torch.tensor(UP, dtype=torch.float64)
     focal = 0.5 * RING_HEIGHT / math.tan(0.5 * RING_FOV)
     K = torch.tensor([[focal, 0.0, RING_WIDTH / 2], [0.0, focal, RING_HEIGHT / 2], [0.0, 0.0, 1.0]])
-    cameras: list[Camera] = []
-    for index in range(count):
-        angle = 2.0 * math.pi * index / count
-        offset = torch.tensor([math.sin(angle), 0.0, -math.cos(angle)], dtype=torch.float64) + RING_RISE * up
-        cameras.append(
-            Camera(look_at(middle + radius * offset, middle, up).float(), K.clone(), RING_WIDTH, RING_HEIGHT, near)
-        )
-    return cameras
+    turns = [2.0 * math.pi * index / count for index in range(count)]
+    ways = [torch.tensor([math.sin(x), 0.0, -math.cos(x)], dtype=torch.float64) + RING_RISE * up for x in turns]
+    viewmats = [look_at(middle + radius * way, middle, up).float() for way in ways]
+    return [Camera(viewmat, K, RING_WIDTH, RING_HEIGHT, near) for viewmat in viewmats]
 
 
 def focus(cameras: Sequence[Camera]) -> torch.Tensor:
@@ -197,6 +196,10 @@ def look_at(position: torch.Tensor, target: torch.Tensor, up: torch.Tensor) -> t
     viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
     viewmat[:3, 3] = -viewmat[:3, :3] @ position
     return viewmat
+
+
+def _looking(camera: Camera, position: torch.Tensor, target: torch.Tensor, up: torch.Tensor) -> Camera:
+    return replace(camera, viewmat=look_at(position, target, up).to(camera.viewmat))
 
 
 def with_pose(camera: Camera, rotation: torch.Tensor, position: torch.Tensor) -> Camera:
@@ -233,19 +236,6 @@ def camera_poses(cameras: Sequence[Camera]) -> tuple[torch.Tensor, torch.Tensor]
         raise ValueError("cameras: expected at least one, got none")
     viewmats = torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras])
     return viewmats, -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
-
-
-def _fit_ellipse(viewmats: torch.Tensor, centres: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Centre (3,), unit axes (2, 3) and semi-axes (2,) of the ellipse, counter-clockwise from above."""
-    mean = centres.mean(0)
-    axes = torch.linalg.svd(centres - mean)[2][:2]
-    # The signs of the axes are arbitrary. The cameras' mean down direction, or forward direction for a vertical plane,
-    # decides the sense of rotation. The signs have no other effect, as the path starts at the first camera.
-    normal = torch.linalg.cross(axes[0], axes[1])
-    if max((viewmats[:, 1:3, :3].mean(0) @ normal).tolist(), key=abs) > 0.0:
-        axes = axes * axes.new_tensor([[1.0], [-1.0]])
-    low, high = torch.quantile((centres - mean) @ axes.T, axes.new_tensor([0.05, 0.95]), dim=0)
-    return mean + (low + high) / 2.0 @ axes, axes, (high - low) / 2.0
 
 
 def focus_ahead(cameras: Sequence[Camera]) -> tuple[torch.Tensor, float]:
