@@ -17,7 +17,6 @@ import shlex
 import subprocess
 import sys
 import textwrap
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -71,21 +70,17 @@ are bold. [Presets and paper](paper.md) says why. `python -m tests.docs.test_doc
 
 def field_docs(owner: type) -> dict[str, str]:
     """Docstrings of a dataclass's fields, on one line each."""
-    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(owner))).body
-    assert isinstance(definition, ast.ClassDef)
     docs = {}
-    for line, following in itertools.pairwise(definition.body):
+    for line, following in itertools.pairwise(definition_of(owner).body):
         if isinstance(line, ast.AnnAssign) and isinstance(following, ast.Expr):
-            assert isinstance(line.target, ast.Name) and isinstance(following.value, ast.Constant)
-            docs[line.target.id] = " ".join(str(following.value.value).split())
+            assert isinstance(following.value, ast.Constant)
+            docs[ast.unparse(line.target)] = " ".join(str(following.value.value).split())
     return docs
 
 
-def described_settings() -> Iterator[tuple[str, str]]:
-    """Names of the settings that a person chooses, and what they mean."""
-    for name in USER_SETTINGS:
-        part, _, key = name.rpartition(".")
-        yield name, field_docs(type(getattr(Config(), part)) if part else Config)[key]
+def definition_of(made: Any) -> Any:
+    """The definition of a class or function as the code has it."""
+    return ast.parse(textwrap.dedent(inspect.getsource(made))).body[0]
 
 
 def cell(text: Any) -> str:
@@ -94,10 +89,11 @@ def cell(text: Any) -> str:
 
 def options_page() -> str:
     """The text of docs/options.md."""
-    page = [SETTINGS]
-    page.append("| KEY | default | `paper` | what | symbol | section |\n|---|---|---|---|---|---|")
+    page = [SETTINGS, "| KEY | default | `paper` | what | symbol | section |\n|---|---|---|---|---|---|"]
     ours, paper = preset("default"), preset("paper")
-    for name, text in described_settings():
+    for name in USER_SETTINGS:
+        part, _, key = name.rpartition(".")
+        text = field_docs(type(getattr(Config(), part)) if part else Config)[key]
         default, theirs = (json.dumps(setting(config, name)) for config in (ours, paper))
         symbol, section = SYMBOLS.get(name, ("", ""))
         theirs = theirs if theirs == default else f"**{theirs}**"
@@ -157,36 +153,19 @@ SECTION = re.compile(r"(Args|Attributes|Buffers|Returns|Yields|Raises):")
 
 def source_signature(made: Any, name: str) -> str:
     """The signature as the code has it, types included."""
-    if isinstance(made, type):
-        if dataclasses.is_dataclass(made):
-            types = annotations_of(made)
-            fields = [
-                f"{field.name}: {types[field.name]}{default_of(field)}"
-                for field in dataclasses.fields(made)
-                if field.init
-            ]
-            return f"{name}({', '.join(fields)})"
-        made = vars(made).get("__init__", None)
-        if made is None:
-            return name
-    node = ast.parse(textwrap.dedent(inspect.getsource(made))).body[0]
-    assert isinstance(node, ast.FunctionDef)
+    if dataclasses.is_dataclass(made):
+        bases = [base for base in reversed(made.__mro__) if dataclasses.is_dataclass(base)]
+        lines = [line for base in bases for line in definition_of(base).body if isinstance(line, ast.AnnAssign)]
+        types = {ast.unparse(line.target): ast.unparse(line.annotation) for line in lines}
+        fields = [f"{x.name}: {types[x.name]}{default_of(x)}" for x in dataclasses.fields(made) if x.init]
+        return f"{name}({', '.join(fields)})"
+    if isinstance(made, type) and "__init__" not in vars(made):
+        return name
+    node = definition_of(made.__init__ if isinstance(made, type) else made)
     if node.args.args and node.args.args[0].arg in ("self", "cls"):
         node.args.args.pop(0)
     result = "" if node.returns is None or node.name == "__init__" else f" -> {ast.unparse(node.returns)}"
     return f"{name}({ast.unparse(node.args)}){result}"
-
-
-def annotations_of(made: type) -> dict[str, str]:
-    """Types of a class's fields as the code has them."""
-    types = {}
-    for base in reversed([base for base in made.__mro__ if dataclasses.is_dataclass(base)]):
-        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        assert isinstance(definition, ast.ClassDef)
-        for line in definition.body:
-            if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
-                types[line.target.id] = ast.unparse(line.annotation)
-    return types
 
 
 def default_of(field: dataclasses.Field[Any]) -> str:
@@ -200,67 +179,58 @@ def markdown_of(doc: str) -> str:
     page: list[str] = []
     section = ""
     for line in doc.splitlines():
-        heading = SECTION.fullmatch(line.strip()) if not line.startswith(" ") else None
+        heading = SECTION.fullmatch(line)
         indent, text = len(line) - len(line.lstrip()), line.strip()
         if heading:
             section = heading[1]
             page += [f"*{section}*", ""]
-        elif section and text and indent == 4:
+        elif section and indent == 4:
             name, colon, rest = text.partition(": ")
             named = colon and re.fullmatch(r"[\w., *]+", name)
-            page.append(
-                f"- `{name}`: {rest}"
-                if named
-                else f"- {text}"
-                if section in ("Args", "Attributes", "Buffers", "Raises")
-                else text
-            )
-        elif section and text and indent > 4:
+            page.append(f"- `{name}`: {rest}" if named else text if section in ("Returns", "Yields") else f"- {text}")
+        elif section and indent > 4:
             page.append(f"  {text}")
         else:
-            section = "" if text and indent == 0 else section
+            section = "" if text else section
             page.append(line)
     return "\n".join(page).strip()
 
 
-def members(made: type) -> Iterator[tuple[str, Any]]:
-    """Public methods and properties of a class with what they are."""
-    for name, value in vars(made).items():
+def section_of(made: Any, name: str) -> list[str]:
+    """The text of a public name, with the methods and properties of a class."""
+    doc = markdown_of(inspect.getdoc(made) or "") + "\n"
+    if inspect.ismodule(made):
+        return [doc]
+    texts = [f"```python\n{source_signature(made, f'nexwarp.{name}')}\n```\n", doc]
+    for member, value in vars(made).items() if isinstance(made, type) else ():
         value = value.__func__ if isinstance(value, (classmethod, staticmethod)) else value
-        if (
-            not name.startswith("_")
-            and inspect.getdoc(value)
-            and (inspect.isfunction(value) or isinstance(value, property | functools.cached_property))
-        ):
-            yield name, value
+        doc = markdown_of(inspect.getdoc(value) or "")
+        if member.startswith("_") or not doc:
+            continue
+        if inspect.isfunction(value):
+            texts += [f"```python\n{source_signature(value, f'{name}.{member}')}\n```\n", f"{doc}\n"]
+        elif isinstance(value, property | functools.cached_property):
+            texts.append(f"`{name}.{member}`: {doc}\n")
+    return texts
 
 
 def api_page() -> str:
     """The text of docs/api.md."""
-    public = {name: getattr(nw, name) for name in nw.__all__ if name != "__version__"}
     table, texts = ["| name | what |", "|---|---|"], []
     for title, rooms in ROOMS.items():
         texts.append(f"## {title}\n")
-        for name in sorted(public, key=str.lower):
-            made = public[name]
+        for name in sorted(nw.__all__, key=str.lower):
+            made = getattr(nw, name)
             module = made.__name__ if inspect.ismodule(made) else made.__module__
-            if module.split(".")[1] not in rooms:
-                continue
-            doc = inspect.getdoc(made) or ""
-            table.append(f"| [`{name}`](#{name.lower()}) | {cell(doc.splitlines()[0])} |")
-            texts.append(f"### {name}\n")
-            if inspect.ismodule(made):
-                texts.append(markdown_of(doc) + "\n")
-                continue
-            texts += [f"```python\n{source_signature(made, f'nexwarp.{name}')}\n```\n", markdown_of(doc) + "\n"]
-            for member, value in members(made) if isinstance(made, type) else ():
-                if inspect.isfunction(value):
-                    texts.append(f"```python\n{source_signature(value, f'{name}.{member}')}\n```\n")
-                    texts.append(markdown_of(inspect.getdoc(value) or "") + "\n")
-                else:
-                    texts.append(f"`{name}.{member}`: {markdown_of(inspect.getdoc(value) or '')}\n")
-    assert len(table) - 2 == len(public), "a public name of a room that no title has"
+            if module.split(".")[1] in rooms:
+                doc = inspect.getdoc(made) or ""
+                table.append(f"| [`{name}`](#{name.lower()}) | {cell(doc.splitlines()[0])} |")
+                texts += [f"### {name}\n", *section_of(made, name)]
+    assert len(table) - 2 == len(nw.__all__), "a public name of a room that no title has"
     return "\n".join([API_PAGE, *table, "", *texts]).rstrip() + "\n"
+
+
+MADE = {"options.md": options_page, "cli.md": commands_page, "api.md": api_page}
 
 
 def test_the_help_of_train_fits_a_screen():
@@ -268,19 +238,14 @@ def test_the_help_of_train_fits_a_screen():
     assert sum(len(textwrap.wrap(line, 80) or [""]) for line in lines) <= 50
 
 
-@pytest.mark.parametrize(
-    ("name", "made"), [("cli.md", commands_page), ("options.md", options_page), ("api.md", api_page)]
-)
-def test_pages_are_those_of_the_code(name, made):
-    assert (DOCS / name).read_text(encoding="utf-8") == made(), "python -m tests.docs.test_docs --write"
-
-
-def test_few_settings_are_for_users():
-    assert set(SYMBOLS) <= set(USER_SETTINGS) <= set(setting_names()) and len(USER_SETTINGS) <= 20
+@pytest.mark.parametrize("name", MADE)
+def test_pages_are_those_of_the_code(name):
+    assert (DOCS / name).read_text(encoding="utf-8") == MADE[name](), "python -m tests.docs.test_docs --write"
 
 
 def test_settings_on_the_page_can_be_set():
-    """What the tables print is what --set takes: each preset is the other one with the page's values."""
+    """They are few. What the tables print is what --set takes: each preset is the other with the page's values."""
+    assert set(SYMBOLS) <= set(USER_SETTINGS) <= set(setting_names()) and len(USER_SETTINGS) <= 20
     ours, paper = PRESETS["default"], PRESETS["paper"]
     values = {name: json.loads(json.dumps(setting(paper, name))) for name in setting_names()}
     assert with_settings(ours, values) == paper
@@ -291,13 +256,6 @@ def test_settings_on_the_page_can_be_set():
 PAGES = [*sorted(DOCS.glob("*.md")), *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md"))]
 
 
-def commands(page: Path) -> list[list[str]]:
-    """Arguments of every nexwarp command in a page's indented blocks."""
-    pattern = rf"\bnexwarp ((?:{'|'.join(cli.COMMANDS)})\b[^#;\n]*)"
-    blocks = re.findall(r"^    .*$", page.read_text(encoding="utf-8"), re.M)
-    return [shlex.split(command) for line in blocks for command in re.findall(pattern, line)]
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_commands_can_be_typed(page, monkeypatch):
     """Every command is understood, and every setting of a training exists and takes its value."""
@@ -305,7 +263,9 @@ def test_commands_can_be_typed(page, monkeypatch):
     for command in cli.COMMANDS.values():
         monkeypatch.setattr(command, "__call__", lambda self, console: understood.append(self))
     monkeypatch.setattr(Train, "starts", lambda self: 0)  # --gpus asks for more than a test machine has
-    for arguments in commands(page):
+    pattern = rf"\bnexwarp ((?:{'|'.join(cli.COMMANDS)})\b[^#;\n]*)"
+    blocks = re.findall(r"^    .*$", page.read_text(encoding="utf-8"), re.M)  # indented
+    for arguments in (shlex.split(command) for line in blocks for command in re.findall(pattern, line)):
         assert cli.main(arguments) == 0, arguments
         command = understood.pop()
         if isinstance(command, Train):
@@ -320,9 +280,9 @@ def test_the_paper_page_lists_all_that_differs():
     assert set(listed) == differ and len(listed) == len(differ)
 
 
-def test_the_readme_and_contributing_are_short():
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 600
-    assert len((ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").split()) <= 260
+@pytest.mark.parametrize(("name", "most"), [("README.md", 600), ("CONTRIBUTING.md", 260)])
+def test_the_first_pages_are_short(name, most):
+    assert len((ROOT / name).read_text(encoding="utf-8").split()) <= most
 
 
 def test_pages_are_in_the_site_s_navigation():
@@ -355,9 +315,8 @@ def main(arguments: list[str]) -> int:
     if arguments != ["--write"]:
         print("usage: python -m tests.docs.test_docs --write", file=sys.stderr)
         return 2
-    (DOCS / "options.md").write_text(options_page(), encoding="utf-8")
-    (DOCS / "cli.md").write_text(commands_page(), encoding="utf-8")
-    (DOCS / "api.md").write_text(api_page(), encoding="utf-8")
+    for name, made in MADE.items():
+        (DOCS / name).write_text(made(), encoding="utf-8")
     return 0
 
 

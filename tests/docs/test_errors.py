@@ -69,11 +69,14 @@ def test_boundaries_raise_the_family(tmp_path, monkeypatch):
 # The terminal
 
 
-def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+def run_info(monkeypatch: pytest.MonkeyPatch, error: BaseException, arguments: str = "info run") -> int:
+    """The exit status of `nexwarp info`, which fails."""
+
     def fail(*_: object) -> None:
         raise error
 
     monkeypatch.setattr(Info, "__call__", fail)
+    return cli.main(arguments.split())
 
 
 @pytest.mark.parametrize(
@@ -93,15 +96,13 @@ def fail_with(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
     ],
 )
 def test_every_error_is_one_line(monkeypatch, capsys, error, code, line):
-    fail_with(monkeypatch, error)
-    assert cli.main(["info", "run"]) == code
+    assert run_info(monkeypatch, error) == code
     assert capsys.readouterr() == ("", f"nexwarp: {line}\n")
 
 
-@pytest.mark.parametrize("arguments", [["--debug", "info", "run"], ["info", "run", "--debug"]])
+@pytest.mark.parametrize("arguments", ["--debug info run", "info run --debug"])
 def test_debug_shows_the_whole_trace(monkeypatch, capsys, arguments):
-    fail_with(monkeypatch, KeyError("means"))
-    assert cli.main(arguments) == 3
+    assert run_info(monkeypatch, KeyError("means"), arguments) == 3
     err = capsys.readouterr().err
     assert err.startswith("Traceback (most recent call last):\n") and "in fail\n    raise error\n" in err
     assert err.splitlines()[-1].startswith("nexwarp: ") and "--debug" not in err.splitlines()[-1]

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import struct
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,6 @@ import nexwarp as nw
 from examples import read_model
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
-from nexwarp.model.detail_limits import DetailLimits
-from nexwarp.model.exposures import Exposures
 from nexwarp.train.settings import setting_names
 from tests.docs.test_docs import DOCS, ROOT
 from tests.scene_writers import expose_photos, write_demo
@@ -36,33 +35,27 @@ def run(tmp_path_factory, one_torch_thread: None) -> Path:
     return folder / "run"
 
 
-# docs/format.md
-
-
 def section(title: str) -> str:
     """Text of docs/format.md below a heading, up to the next of its kind."""
     page = (DOCS / "format.md").read_text(encoding="utf-8")
     return page.split(f"\n## {title}\n", 1)[1].split("\n## ", 1)[0]
 
 
-def named(text: str) -> list[str]:
+def named(text: str) -> set[str]:
     """First cells of a text's tables."""
-    return re.findall(r"^\| `([^`]+)` \|", text, re.M)
+    return set(re.findall(r"^\| `([^`]+)` \|", text, re.M))
 
 
-def header_of(file: Path) -> dict[str, Any]:
+def header_of(file: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """What a safetensors file says of its tensors, and its metadata."""
     data = file.read_bytes()
     (size,) = struct.unpack("<Q", data[:8])
-    header = json.loads(data[8 : 8 + size])
-    assert isinstance(header, dict)
-    return header
+    tensors = json.loads(data[8 : 8 + size])
+    return tensors, tensors.pop("__metadata__", {})
 
 
-def header(run: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    tensors = header_of(run / "model.safetensors")
-    metadata = tensors.pop("__metadata__")
-    assert set(metadata) == {"nexwarp"}
-    return tensors, json.loads(metadata["nexwarp"])
+def parsed(file: Path) -> Any:
+    return json.loads(file.read_text())
 
 
 def flat(data: dict[str, Any], *parts: str) -> set[str]:
@@ -74,38 +67,46 @@ def flat(data: dict[str, Any], *parts: str) -> set[str]:
 def test_files(run):
     listed = named((DOCS / "format.md").read_text(encoding="utf-8").split("\n## ", 1)[0])
     optional = {"tensorboard/", "camera_path_N.json", "export/", "teachers/N/"}
-    assert {f.name + "/" * f.is_dir() for f in run.iterdir()} == set(listed) - optional
-    assert {f.name for f in (run / "checkpoint").iterdir()} == set(named(section("checkpoint/")))
+    assert {f.name + "/" * f.is_dir() for f in run.iterdir()} == listed - optional
+    assert {f.name for f in (run / "checkpoint").iterdir()} == named(section("checkpoint/"))
     assert {f.name for f in (run / "renders").iterdir()} == {"test", "compare"}
+    config, cameras = parsed(run / "config.json"), parsed(run / "cameras.json")
+    assert flat(config, "scene") == named(section("config.json"))
+    assert flat(config["config"], "losses", "rates", "texture", "densify") == set(setting_names())
+    assert set(cameras) == {"train", "test"}
+    for camera in [*cameras["train"].values(), *cameras["test"].values()]:
+        assert set(camera) == named(section("cameras.json"))
+    assert set(parsed(run / "metrics.json")) == named(section("metrics.json"))
+    for line in (run / "metrics.jsonl").read_text().splitlines():
+        assert set(json.loads(line)) == named(section("metrics.jsonl"))
+    groups = {name.split(".")[0] for name in header_of(run / "checkpoint" / "tensors.safetensors")[0]}
+    assert groups == set(re.findall(r"`(\w+)\.\*`", section("checkpoint/")))
 
 
 def test_tensors(run):
     """Names, types and shapes of the table are those of the file, and the keys of its metadata."""
-    tensors, meta = header(run)
-    rows = re.findall(r"^\| `([a-z0-9A-Z_.]+)` \| (F\d\d) \| ([^|]+) \|", section("model.safetensors"), re.M)
-    shape = meta["texture"]
-    sizes = {"N": tensors["surfels.means"]["shape"][0], "C - 1": 15, "3": 3, "1": 1, "2": 2, "4": 4}
-    sizes |= {
-        "V": len(json.loads((run / "cameras.json").read_text())["train"]),
-        "L": shape["levels"],
-        "T": shape["table_size"],
-        "F": shape["features"],
-    }
+    tensors, metadata = header_of(run / "model.safetensors")
+    assert set(metadata) == {"nexwarp"}
+    meta = json.loads(metadata["nexwarp"])
+    text, shape = section("model.safetensors"), meta["texture"]
+    sizes = {"N": tensors["surfels.means"]["shape"][0], "C - 1": 15, "V": len(parsed(run / "cameras.json")["train"])}
+    sizes |= {"L": shape["levels"], "T": shape["table_size"], "F": shape["features"]}
     expected = {}
-    for name, dtype, dimensions in rows:
+    for name, dtype, dimensions in re.findall(r"^\| `([a-z0-9A-Z_.]+)` \| (F\d\d) \| ([^|]+) \|", text, re.M):
         if ".I." in name:
             widths = [sizes["L"] * sizes["F"], *[shape["width"]] * shape["hidden_layers"], 48]
             for i, (inner, outer) in enumerate(itertools.pairwise(widths)):
                 expected[name.replace("I", str(2 * i))] = (dtype, [outer, inner])
         else:
-            expected[name] = (dtype, [sizes[d.strip()] for d in dimensions.split(",")])
+            wanted = [d.strip() for d in dimensions.split(",")]
+            expected[name] = (dtype, [int(d) if d.isdigit() else sizes[d] for d in wanted])
     assert {name: (t["dtype"], t["shape"]) for name, t in tensors.items()} == expected
-    assert set(named(section("model.safetensors").split("a JSON object:", 1)[1])) == flat(meta, "texture")
+    assert named(text.split("a JSON object:", 1)[1]) == flat(meta, "texture")
 
 
 def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
     """The program of examples/, executed: pixels of a test view, to rounding."""
-    cameras = json.loads((run / "cameras.json").read_text())["test"]
+    cameras = parsed(run / "cameras.json")["test"]
     name = next(iter(cameras))
     camera = load_cameras(run / "cameras.json")["test"][name]
     model = nw.load(run)
@@ -119,9 +120,9 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
         model.surfels.logit_opacities.uniform_(-2, 5)
         model.surfels.shN.normal_(0, 0.2)
     count = len(model.surfels)
-    model.detail_limits = DetailLimits(torch.rand(count) * 0.2, torch.rand(count) * 0.4)  # within, and beyond
+    model.detail_limits = nw.DetailLimits(torch.rand(count) * 0.2, torch.rand(count) * 0.4)  # within, and beyond
     gains = torch.tensor([[0.2, 0.1, 0.0], [0.0, 0.3, 0.1], [0.1, 0.0, 0.4]])
-    model.exposures = Exposures.of(gains, others, (-0.3, -0.4, 0.15))
+    model.exposures = nw.Exposures.of(gains, others, (-0.3, -0.4, 0.15))
     pixels = [(3, 5), (24, 18), (40, 30), (47, 0), (11, 27), (30, 9)]
     # As trained; with the texture in place of the plain colours; and with each option that a file may hold.
     for residual, changes in (
@@ -153,67 +154,45 @@ def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
         assert (abs(expected - untextured).max() > 0.01) == (stored.options.max_hits > 0 and residual is not None)
 
 
-def test_json_files(run):
-    config = json.loads((run / "config.json").read_text())
-    assert flat(config, "scene") == set(named(section("config.json")))
-    assert flat(config["config"], "losses", "rates", "texture", "densify") == set(setting_names())
-    cameras = json.loads((run / "cameras.json").read_text())
-    assert set(cameras) == {"train", "test"}
-    for camera in [*cameras["train"].values(), *cameras["test"].values()]:
-        assert set(camera) == set(named(section("cameras.json")))
-    metrics = json.loads((run / "metrics.json").read_text())
-    assert list(metrics) and set(metrics) == set(named(section("metrics.json")))
-    for line in (run / "metrics.jsonl").read_text().splitlines():
-        assert set(json.loads(line)) == set(named(section("metrics.jsonl")))
-
-
-def test_checkpoint(run):
-    groups = {name.split(".")[0] for name in header_of(run / "checkpoint" / "tensors.safetensors")} - {"__metadata__"}
-    assert groups == set(re.findall(r"`(\w+)\.\*`", section("checkpoint/")))
-
-
 # The Python of docs/paper.md, docs/migrating.md, docs/depth.md and the README
 
 
-def python_of(page: str) -> list[str]:
-    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.S)
-
-
-def test_the_python_of_paper_and_migrating_runs(run, tmp_path, monkeypatch, capsys):
-    (tmp_path / "runs" / "one").mkdir(parents=True)
-    shutil.copy(run / "metrics.json", tmp_path / "runs" / "one")
+@pytest.fixture
+def execute(run, tmp_path, monkeypatch) -> Callable[[str], list[dict[str, Any]]]:
+    """What executes the examples of a page in a folder with a run, runs/demo, and returns their names."""
+    shutil.copytree(run, tmp_path / "runs" / "demo")
     monkeypatch.chdir(tmp_path)
-    (means,) = python_of("docs/paper.md")
-    exec(means, {})
-    metrics = json.loads((run / "metrics.json").read_text())
+
+    def executed(page: str) -> list[dict[str, Any]]:
+        examples: list[dict[str, Any]] = []
+        for text in re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.S):
+            examples.append({"lines": len([line for line in text.splitlines() if line])})
+            exec(text, examples[-1])
+        return examples
+
+    return executed
+
+
+def test_the_python_of_paper_and_migrating_runs(execute, run, capsys):
+    execute("docs/paper.md")
+    metrics = parsed(run / "metrics.json")
     assert capsys.readouterr().out == f"{ {key: metrics[key] for key in ('psnr', 'ssim', 'megabytes', 'seconds')} }\n"
-    (example,) = python_of("docs/migrating.md")
-    names: dict[str, Any] = {}
-    exec(example, names)
+    (names,) = execute("docs/migrating.md")
     assert names["image"].shape == (200, 300, 3) and names["image"].max() > 0.1
 
 
-def test_the_readme_s_python_runs(run, tmp_path, monkeypatch, capsys):
+def test_the_readme_s_python_runs(execute, capsys):
     """As it stands, where a run of the demo is."""
-    shutil.copytree(run, tmp_path / "runs" / "demo")
-    monkeypatch.chdir(tmp_path)
-    (example,) = python_of("README.md")
-    assert len([line for line in example.splitlines() if line]) <= 12
-    names: dict[str, Any] = {}
-    exec(example, names)
+    (names,) = execute("README.md")
+    assert names["lines"] <= 12
     shapes = "torch.Size([36, 48, 3]) torch.Size([36, 48]) torch.Size([36, 48, 3]) torch.Size([36, 48])"
     assert capsys.readouterr().out.splitlines()[0] == shapes
     assert names["model"].surfels.means.grad.norm() > 0
 
 
-def test_the_depth_page_s_python_runs(run, tmp_path, monkeypatch):
+def test_the_depth_page_s_python_runs(execute, tmp_path):
     """It reads what its command writes."""
-    shutil.copytree(run, tmp_path / "runs" / "demo")
-    monkeypatch.chdir(tmp_path)
     assert cli.main(["render", "runs/demo", "--set", "test", "--buffers"]) == 0
-    examples = python_of("docs/depth.md")
-    assert len(examples) == 2
-    for example in examples:
-        exec(example, {})
+    assert len(execute("docs/depth.md")) == 2
     views = len(list((tmp_path / "runs" / "demo" / "renders" / "test").glob("*.png")))
     assert len(list(tmp_path.glob("*.npy"))) == len(list(tmp_path.glob("depth_*.png"))) == views > 0

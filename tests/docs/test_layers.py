@@ -18,13 +18,6 @@ PURE |= {"types", "contextlib"}
 MOST_ROOMS, MOST_ARROWS = 17, 80  # benchmarks and notebooks are two of the rooms
 MOST_OF_TRAINER = 18  # modules of ours that the trainer imports
 
-TIMED_IMPORT = """
-import time, torch
-start = time.process_time()
-import nexwarp
-print(time.process_time() - start)
-"""
-
 
 def imported_modules(path: Path) -> set[str]:
     """Return every dotted name that a file imports, at any nesting depth."""
@@ -38,10 +31,6 @@ def imported_modules(path: Path) -> set[str]:
     return found
 
 
-def modules() -> list[Path]:
-    return sorted(ROOT.rglob("*.py"))
-
-
 def test_the_list_of_layers_is_that_of_the_rooms() -> None:
     rooms = {path.stem if path.is_file() else path.name for path in ROOT.iterdir() if path.name != "__pycache__"}
     rooms -= EXEMPT | {"py"}
@@ -51,7 +40,7 @@ def test_the_list_of_layers_is_that_of_the_rooms() -> None:
 
 def test_imports_point_downwards() -> None:
     arrows = set()
-    for path in modules():
+    for path in sorted(ROOT.rglob("*.py")):
         here = path.relative_to(ROOT).with_suffix("").parts[0]
         if here in EXEMPT:
             continue
@@ -76,7 +65,7 @@ def test_the_trainer_imports_few_modules() -> None:
 def test_types_say_something() -> None:
     """Outside kernels: few `Any`, and no SimpleNamespace."""
     any_, loose = 0, []
-    for path in modules():
+    for path in sorted(ROOT.rglob("*.py")):
         if path.is_relative_to(ROOT / "kernels") or path.is_relative_to(ROOT / "native"):
             continue
         names = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Name)]
@@ -97,7 +86,8 @@ def test_kernels_are_pure_warp() -> None:
 
 def test_import_is_quick_and_compiles_nothing(tmp_path: Path) -> None:
     """In the least of three fresh processes."""
-    command = [sys.executable, "-c", TIMED_IMPORT]
+    program = "import time, torch; start = time.process_time(); import nexwarp; print(time.process_time() - start)"
+    command = [sys.executable, "-c", program]
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
     seconds = []
     for _ in range(3):

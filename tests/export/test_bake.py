@@ -13,16 +13,11 @@ from nexwarp.export.bake import Baked, bake, evaluate, lay_out, observe
 from nexwarp.export.glb import CUTOFF, save_glb, upright
 from nexwarp.export.splats import save_splats_spz
 from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE, encode_atlas, encode_baked, encode_harmonics
-from tests.export.web.baked_support import bilinear, composited, ring
-from tests.export.web.scene_reader import as_stored, decode_atlas, decode_harmonics
+from tests.export.web.support import as_stored, bilinear, composited, decode_atlas, decode_harmonics, psnr, ring
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
-
-def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
-    return float(-10 * (a - b).square().mean().log10())
 
 
 def make_model(residual: bool = True, count: int = 12, sh_degree: int = 1) -> nw.Model:

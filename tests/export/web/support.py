@@ -1,63 +1,66 @@
-"""A model for the web renderer, and a server of a page's files."""
+"""Models and pages for tests of the web renderer, a reader of their files, and the baked scene by its definition.
 
+The reader is written from FORMAT.md, independent of the writer and the page.
+"""
+
+import io
+import json
 import shutil
-import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+import struct
+import zlib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from PIL import Image
 
 import nexwarp as nw
-from nexwarp.model.detail_limits import DetailLimits
-from nexwarp.model.exposures import Exposures
-from tests.scenes import make_camera, make_surfels, random_scene
+from nexwarp import ops
+from nexwarp.export.bake import Baked
+from nexwarp.export.web.baked import encode_harmonics, encode_picture
+from nexwarp.export.web.quantise import CHUNK
+from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
+from nexwarp.model.detail_limits import NEVER
+from tests.reference.collect import rotations
+from tests.scenes import intrinsics, make_camera, make_surfels, random_scene, rigid
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 WEBGPU = ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"]
 KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
+DTYPES = {"u8": "<u1", "u16": "<u2", "u32": "<u4", "f16": "<f2", "f32": "<f4"}
+URL = "http://localhost/"  # a secure context
 
 
-def web_model(
-    count: int = 60,
-    *,
-    features: int = 2,
-    residual: bool = True,
-    hidden_layers: int = 2,
-    texture_degree: int = 3,
-    sh_degree: int = 3,
-    options: nw.RenderOptions | None = None,
-) -> tuple[nw.Model, nw.Camera]:
+def web_model(count: int = 60, *, options: nw.RenderOptions | None = None, **shape: Any) -> tuple[nw.Model, nw.Camera]:
     """Return a small model with texture, exposures with a falloff and detail limits, and a camera.
 
     Values of the texture are exact in half precision, as those of model files are.
     """
-    scene = random_scene(count, width=37, height=27, sh_degree=sh_degree)
+    scene = random_scene(count, width=37, height=27)
     generator = torch.Generator().manual_seed(3)
-    texture = nw.NeuralTexture(
-        levels=3,
-        table_size=2**9,
-        features=features,
-        min_resolution=1.0,
-        max_resolution=8.0,
-        width=12,
-        hidden_layers=hidden_layers,
-        sh_degree=texture_degree,
-        residual=residual,
-    )
+    shape = {
+        "levels": 3,
+        "table_size": 2**9,
+        "max_resolution": 8.0,
+        "width": 12,
+        "features": 2,
+        "residual": True,
+    } | shape
+    texture = nw.NeuralTexture(**{"min_resolution": 1.0, "hidden_layers": 2, **shape})
     with torch.no_grad():
         for parameter in texture.parameters():
             parameter.copy_((0.4 * torch.randn(parameter.shape, generator=generator)).half().float())
     camera = make_camera(scene)
-    viewmats = [camera.viewmat.detach().clone() for _ in range(4)]
-    for i, viewmat in enumerate(viewmats):
-        viewmat[0, 3] += 0.3 * i
-    cameras = [nw.Camera(viewmat, camera.K, camera.width, camera.height) for viewmat in viewmats]
+    camera = replace(camera, viewmat=camera.viewmat.detach())
+    shifts = torch.zeros(4, 4, 4)
+    shifts[:, 0, 3] = 0.3 * torch.arange(4)
+    cameras = [replace(camera, viewmat=camera.viewmat + shift) for shift in shifts]
     gains = torch.tensor([[0.1, 0.0, -0.1], [0.0, 0.05, 0.0], [-0.1, 0.0, 0.1], [0.05, 0.0, 0.0]])
-    exposures = Exposures.of(gains, cameras, falloff=(-0.3, 0.05, 0.8))
-    limits = DetailLimits(torch.full((count,), 0.05), torch.linspace(0.08, 0.3, count))
+    exposures = nw.Exposures.of(gains, cameras, falloff=(-0.3, 0.05, 0.8))
+    limits = nw.DetailLimits(torch.full((count,), 0.05), torch.linspace(0.08, 0.3, count))
     options = options or nw.RenderOptions(background=(0.1, 0.2, 0.3))
-    camera = nw.Camera(camera.viewmat.detach(), camera.K, camera.width, camera.height, camera.near)
     return nw.Model(make_surfels(scene), texture, exposures, limits, options), camera
 
 
@@ -66,38 +69,166 @@ def named_cameras(camera: nw.Camera) -> dict[str, nw.Camera]:
     return {"a.png": camera, "b.png": camera.crop(2, 1, 20, 16)}
 
 
-def psnr(actual: np.ndarray, expected: np.ndarray) -> float:
+def entry_of(camera: nw.Camera) -> dict[str, object]:
+    """A camera as the page takes it."""
+    K = [camera.fx, camera.fy, camera.cx, camera.cy]
+    size = {"width": camera.width, "height": camera.height, "near": camera.near}
+    return {"viewmat": camera.viewmat.flatten().tolist(), "K": K, **size}
+
+
+def psnr(actual: torch.Tensor, expected: torch.Tensor) -> float:
     """PSNR of two images, without clamping."""
-    return float(-10 * np.log10(max(np.mean((actual.astype(np.float64) - expected) ** 2), 1e-20)))
+    return float(-10 * (actual.double() - expected).square().mean().clamp_min(1e-20).log10())
 
 
-class Site:
-    """A page's files on a server of its own; tests change them."""
+class Tab:
+    """A browser's page that finds `files` at URL; what it asked for and complained about."""
 
-    def __init__(self, files: dict[str, bytes]) -> None:
-        self.files = files
-        site = self
+    def __init__(self, browser: Any, files: dict[str, bytes], **options: Any) -> None:
+        self.context = browser.new_context(**options)
+        self.page = self.context.new_page()
+        self.files = dict(files)
+        self.errors: list[str] = []
+        self.requests: list[str] = []
+        self.page.route(lambda url: url.startswith(URL), self._answer)
+        self.page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
 
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                name = self.path.partition("?")[0].lstrip("/") or "index.html"
-                content = site.files.get(name)
-                self.send_response(200 if content is not None else 404)
-                self.send_header("Content-Type", KINDS.get(Path(name).suffix, "application/octet-stream"))
-                self.send_header("Content-Length", str(len(content or b"")))
-                self.end_headers()
-                self.wfile.write(content or b"")
+    def _answer(self, route: Any) -> None:
+        name = route.request.url.removeprefix(URL).partition("?")[0] or "index.html"
+        kind = KINDS.get(Path(name).suffix, "application/octet-stream")
+        found = name in self.files
+        route.fulfill(status=200 if found else 404, content_type=kind, body=self.files.get(name, b""))
 
-            def log_message(self, *_: object) -> None:
-                pass
+    def value(self, expression: str, *arguments: Any) -> Any:
+        """What an expression is in the page."""
+        return self.page.evaluate(expression, *arguments)
 
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.server.server_port}/"
-        threading.Thread(target=self.server.serve_forever, daemon=True).start()
 
-    def __enter__(self) -> "Site":
-        return self
+def ring(count: int = 4, width: int = 64, height: int = 48) -> dict[str, nw.Camera]:
+    """Cameras around the random scene."""
+    cameras = {}
+    for i in range(count):
+        viewmat = rigid((0.9, 0.2, -0.3 + 0.06 * i, 0.1), (0.3 - 0.2 * i, -0.2, 0.5)).float()
+        K = intrinsics(0.8 * width, 0.8 * width, width / 2, height / 2).float()
+        cameras[f"{i}.png"] = nw.Camera(viewmat, K, width, height)
+    return cameras
 
-    def __exit__(self, *_: object) -> None:
-        self.server.shutdown()
-        self.server.server_close()
+
+def bilinear(atlas: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Values (..., C) of an image (H, W, C) at places (..., 2), column and row of texel centres."""
+    low = places.floor().long()
+    share = places - low
+    total = torch.zeros(*places.shape[:-1], atlas.shape[2], dtype=places.dtype)
+    for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        weight = (share[..., 0] if x else 1 - share[..., 0]) * (share[..., 1] if y else 1 - share[..., 1])
+        column = (low[..., 0] + x).clamp(0, atlas.shape[1] - 1)
+        row = (low[..., 1] + y).clamp(0, atlas.shape[0] - 1)
+        total += weight[..., None] * atlas[row, column]
+    return total
+
+
+@torch.no_grad()
+def composited(baked: Baked, camera: nw.Camera) -> torch.Tensor:
+    """The image (H, W, 3) in float64, without tiles: every surfel at every pixel."""
+    surfels = baked.surfels.double()
+    viewmat, eye = camera.viewmat.double(), camera.position.double()
+    frames = rotations(surfels.quats)
+    y, x = torch.meshgrid(torch.arange(camera.height).double(), torch.arange(camera.width).double(), indexing="ij")
+    rays = torch.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, torch.ones_like(x)], -1)
+    rays = rays.reshape(-1, 3) @ viewmat[:3, :3]
+    depths = ((surfels.means - eye) * frames[:, :, 2]).sum(1) / (rays @ frames[:, :, 2].T)
+    offsets = eye + depths[..., None] * rays[:, None] - surfels.means
+    local = torch.einsum("pni,nij->pnj", offsets, frames)[..., :2] / surfels.scales
+    exponents = local.square().clamp_min(TINY).pow(surfels.gammas).sum(-1)
+    alphas = (surfels.opacities * torch.exp(-0.5 * exponents)).clamp(max=ALPHA_MAX)
+    alphas = alphas.where((alphas >= ALPHA_MIN) & (depths > camera.near), 0.0)
+    plain = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, eye, baked.model.options.sh_degree)
+    ids = torch.arange(len(surfels.means)).expand(local.shape[:2])
+    places = baked.layout.texels(ids, local)
+    colors = (plain + bilinear(baked.atlas.double(), places)).clamp_min(0)
+    image, left = torch.zeros(len(rays), 3).double(), torch.ones(len(rays), 1).double()
+    for i in ((surfels.means @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]).argsort().tolist():
+        image += left * alphas[:, i, None] * colors[:, i]
+        left *= 1 - alphas[:, i, None]
+    image += left * torch.tensor(baked.model.options.background).double()
+    return image.reshape(camera.height, camera.width, 3)
+
+
+def read_sections(content: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The header, and the arrays of the sections by name."""
+    version, length = struct.unpack_from("<II", content, 8)
+    assert version == 1
+    header = json.loads(content[16 : 16 + length])
+    arrays = {}
+    for entry in header["sections"]:
+        start = 16 + length + entry["offset"]
+        stored = content[start : start + entry["bytes"]]
+        data = zlib.decompress(stored) if entry["encoding"] == "deflate" else stored
+        arrays[entry["name"]] = np.frombuffer(data, DTYPES[entry["dtype"]]).reshape(entry["shape"])
+    return header, arrays
+
+
+def read_surfels(content: bytes) -> dict[str, np.ndarray]:
+    """The surfels of a scene file, float32."""
+    header, arrays = read_sections(content)
+    if header["quality"] == "full":
+        return arrays
+    ranges, count, bands = arrays["ranges"], header["surfels"], round(header["sh_coefficients"] ** 0.5)
+    columns = np.repeat(np.arange(7, 7 + bands), [3 * (2 * band + 1) for band in range(bands)])
+    data = {
+        "means": decode_chunks(arrays["means"].T, ranges[:, :3]),
+        "quats": decode_quats(arrays["quats"]),
+        "scales": np.exp(decode_chunks(arrays["scales"].T, ranges[:, 3:5])),
+        "opacities": arrays["opacities"].astype(np.float32) / 255,
+        "gammas": np.maximum(np.exp(decode_chunks(arrays["gammas"].T, ranges[:, 5:7])), 1),
+        "sh": decode_chunks(arrays["sh"].T, ranges[:, columns]).reshape(count, bands**2, 3),
+    }
+    if "limits" in arrays:
+        data["limits"] = decode_limits(arrays["limits"].T, arrays["limits_scale"])
+    return data
+
+
+def decode_chunks(codes: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+    """The (N, C) float32 values of codes."""
+    whole = np.repeat(ranges, CHUNK, axis=0)[: len(codes)]
+    return whole[..., 0] + whole[..., 1] * codes.astype(np.float32)
+
+
+def decode_quats(code: np.ndarray) -> np.ndarray:
+    """(N, 4) unit quaternions, wxyz."""
+    x = ((code & 2047) / 2047 * 2 - 1) * np.sqrt(0.5)
+    y = (((code >> 11) & 2047) / 2047 * 2 - 1) * np.sqrt(0.5)
+    z = ((code >> 22) / 1023 * 2 - 1) * np.sin(np.pi / 8)
+    w = np.sqrt(np.maximum(1 - x**2 - y**2 - z**2, 0.0))
+    quats = np.stack([w, x, y, z], axis=1)
+    return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
+
+
+def decode_limits(codes: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """(N, 2) float32 detail limits."""
+    values = np.exp(scale[0] + scale[1] * (codes.astype(np.float32) - 1))
+    return np.where(codes == 65535, np.float32(NEVER), np.where(codes == 0, 0, values)).astype(np.float32)
+
+
+def decode_harmonics(codes: np.ndarray, ranges: list[float]) -> np.ndarray:
+    """The (N, C - 1, 3) float32 coefficients of a baked scene."""
+    steps = codes.astype(np.float32) - 128
+    degrees = np.floor(np.sqrt(np.arange(codes.shape[1]) + 1)).astype(int)
+    return (np.sign(steps) * (steps / 127) ** 2 * np.array(ranges, np.float32)[degrees - 1][:, None]).astype(np.float32)
+
+
+def decode_atlas(codes: torch.Tensor, scale: float) -> torch.Tensor:
+    """The float32 atlas of codes."""
+    return (codes.float() - 128) * (scale / 127)
+
+
+def as_stored(baked: Baked) -> Baked:
+    """A baked scene with the colours that its files hold."""
+    picture, scale = encode_picture(baked.atlas)
+    with Image.open(io.BytesIO(picture)) as image:
+        codes = torch.from_numpy(np.array(image.convert("RGB")))
+    state = dict(baked.surfels.state_dict())
+    state["shN"] = torch.from_numpy(decode_harmonics(*encode_harmonics(baked.surfels))).to(state["shN"])
+    return replace(baked, surfels=nw.Surfels(state), atlas=decode_atlas(codes, scale).to(baked.atlas))

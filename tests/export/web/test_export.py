@@ -9,8 +9,7 @@ import pytest
 from nexwarp.export.web.export import INDEX, export_web, one_file, static_files
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
 from nexwarp.kernels import sh
-from tests.export.web.scene_reader import read_sections
-from tests.export.web.support import named_cameras, web_model
+from tests.export.web.support import named_cameras, read_sections, web_model
 
 
 def page_of(title: str = "demo") -> tuple[str, dict[str, bytes]]:

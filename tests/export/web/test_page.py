@@ -1,10 +1,10 @@
 """The web page in a browser: loading, controls, links, touch, damaged files, and the baked scene against Python."""
 
-import dataclasses
 import functools
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +13,11 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.export.bake import bake as bake_model
-from nexwarp.export.web import baked as baked_files
+from nexwarp.export.bake import bake
+from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE
 from nexwarp.export.web.export import page_files, static_files
 from nexwarp.export.web.scene_file import SCENE_FILE
-from nexwarp.model.detail_limits import DetailLimits
-from nexwarp.model.exposures import Exposures
-from tests.export.web.baked_support import ring
-from tests.export.web.scene_reader import as_stored, read_sections
-from tests.export.web.support import CHROMIUM, WEBGPU, Site
+from tests.export.web.support import CHROMIUM, URL, WEBGPU, Tab, as_stored, entry_of, psnr, read_sections, ring
 from tests.scenes import make_surfels, make_texture, random_scene
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
@@ -34,6 +30,7 @@ DRAW = """async camera => {
     await renderer.render(camera);
     return [Array.from(await renderer.read("image")), await renderer.pick(32.5, 24.5)];
 }"""
+TARGET = "(p => p.eye.map((x, i) => x + p.distance * p.axes().forward[i]))(nexwarp.pose)"
 POSE = "[...nexwarp.pose.eye, nexwarp.pose.yaw, nexwarp.pose.pitch, nexwarp.pose.distance]"
 
 pytestmark = [
@@ -53,8 +50,8 @@ def model(cameras) -> nw.Model:
     """A small model with everything that a page has to show: exposures, vignetting, detail limits."""
     surfels = make_surfels(random_scene(40, width=64, height=48, seed=3))
     gains = torch.linspace(-0.3, 0.3, len(cameras))[:, None].expand(-1, 3) * torch.tensor([1.0, 0.5, -0.5])
-    exposures = Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
-    limits = DetailLimits(torch.full((40,), 0.01), torch.full((40,), 0.04))
+    exposures = nw.Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
+    limits = nw.DetailLimits(torch.full((40,), 0.01), torch.full((40,), 0.04))
     texture = make_texture(residual=True)
     with torch.no_grad():
         texture.grid.mul_(0.3)
@@ -62,50 +59,27 @@ def model(cameras) -> nw.Model:
 
 
 @pytest.fixture(scope="module")
-def site(model, cameras) -> Iterator[Site]:
+def site(model, cameras) -> dict[str, bytes]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(baked_files, "bake_model", functools.partial(bake_model, steps=10))
-        site = Site(page_files(model, cameras, title="Two & <three>"))
-    with site:
-        yield site
+        patch.setattr("nexwarp.export.web.baked.bake_model", functools.partial(bake, steps=10))
+        return page_files(model, cameras, title="Two & <three>")
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    api = pytest.importorskip("playwright.sync_api")
-    with api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield browser
-        browser.close()
-
-
-class Tab:
-    """A page, and what it asked for and complained about."""
-
-    def __init__(self, browser: Any, width: int = 200, height: int = 150, **options: Any) -> None:
-        self.context = browser.new_context(viewport={"width": width, "height": height}, **options)
-        self.page = self.context.new_page()
-        self.errors: list[str] = []
-        self.requests: list[str] = []
-        self.page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("request", lambda request: self.requests.append(request.url))
+class PageTab(Tab):
+    """A page of a scene."""
 
     def wait(self, condition: str, seconds: float = 60.0) -> None:
         """Wait for a condition; the page's policy forbids what playwright's own wait needs."""
         for _ in range(int(seconds / 0.05)):
-            if self.page.evaluate(condition):
+            if self.value(condition):
                 return
             self.page.wait_for_timeout(50)
-        state = self.page.evaluate("globalThis.nexwarp ? nexwarp.state : 'no page'")
+        state = self.value("globalThis.nexwarp ? nexwarp.state : 'no page'")
         raise AssertionError(f"{condition}: not within {seconds} s; {state}: {self.message} {self.errors}")
 
-    def open(self, url: str) -> None:
-        self.page.goto(url)
+    def open(self, query: str = "") -> None:
+        self.page.goto(URL + query)
         self.wait(FINISHED)
-
-    def value(self, expression: str) -> Any:
-        return self.page.evaluate(expression)
 
     @property
     def message(self) -> str:
@@ -120,39 +94,43 @@ class Tab:
 
 
 @pytest.fixture
-def tab(browser) -> Iterator[Tab]:
-    tab = Tab(browser)
-    yield tab
-    tab.context.close()
+def open_tab(site) -> Iterator[Callable[..., PageTab]]:
+    """What opens a tab of a browser that has WebGPU or not; of a size, or with further options of a context."""
+    api = pytest.importorskip("playwright.sync_api")
+    with api.sync_playwright() as playwright:
+
+        def opened(width: int = 200, height: int = 150, *, webgpu: bool = False, **options: Any) -> PageTab:
+            flags = [*FLAGS, *(WEBGPU if webgpu else ())]
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+            return PageTab(browser, site, viewport={"width": width, "height": height}, **options)
+
+        yield opened
 
 
-def test_the_baked_scene_in_the_page_is_the_one_of_python(tab, site, model, cameras):
-    baked = as_stored(bake_model(model, list(cameras.values()), steps=10))
-    tab.open(f"{site.url}?renderer=baked")
+@pytest.fixture
+def tab(open_tab) -> PageTab:
+    return open_tab()
+
+
+def test_the_baked_scene_in_the_page_is_the_one_of_python(tab, model, cameras):
+    baked = as_stored(bake(model, list(cameras.values()), steps=10))
+    tab.open("?renderer=baked")
     picked = 0
     # Far away too: surfels are blurred beyond their detail limits.
     shift = torch.eye(4)
     shift[2, 3] = 6.0
-    far = nw.Camera(shift @ cameras["2.png"].viewmat, cameras["2.png"].K, 64, 48)
+    far = replace(cameras["2.png"], viewmat=shift @ cameras["2.png"].viewmat)
     # And with a near plane amid the surfels.
     depths = model.render(cameras["1.png"]).depths[..., 0].detach()
-    cut = dataclasses.replace(cameras["1.png"], near=depths[depths > 0].median().item())
+    cut = replace(cameras["1.png"], near=depths[depths > 0].median().item())
     for camera in (cameras["1.png"], cameras["3.png"], far, cut):
-        given = {
-            "viewmat": camera.viewmat.flatten().tolist(),
-            "K": [camera.fx, camera.fy, camera.cx, camera.cy],
-            "width": camera.width,
-            "height": camera.height,
-            "near": camera.near,
-        }
-        drawn = tab.page.evaluate(DRAW, given)
+        drawn = tab.value(DRAW, entry_of(camera))
         image = torch.tensor(drawn[0]).reshape(camera.height, camera.width, 4)[..., :3]
         with torch.no_grad():
             expected = (baked.render(camera) * model.exposures.factors(camera)).clamp(0, 1)
-            psnr = -10 * (image - expected).square().mean().log10()
             out = model.render(camera)
         # Pixels where the near plane cuts a surfel may differ; without the plane, the picture has under 20 dB.
-        assert psnr > (35 if camera is cut else 42), f"{psnr:.1f} dB"
+        assert psnr(image, expected) > (35 if camera is cut else 42)
         if out.alpha[24, 32] > 0.11 and camera is not cut:
             assert drawn[1]["depth"] == pytest.approx(float(out.median_depth[24, 32]), rel=1e-3)
             picked += 1
@@ -160,8 +138,8 @@ def test_the_baked_scene_in_the_page_is_the_one_of_python(tab, site, model, came
     assert not tab.errors
 
 
-def test_controls_modes_links_and_sizes(tab, site):
-    tab.open(f"{site.url}?renderer=baked")
+def test_controls_modes_links_and_sizes(tab):
+    tab.open("?renderer=baked")
     page = tab.page
     assert page.title() == "Two & <three>" and page.inner_text("h1") == "Two & <three>"
     start, image = tab.value(POSE), tab.picture()
@@ -173,8 +151,7 @@ def test_controls_modes_links_and_sizes(tab, site):
     tab.wait(FINISHED)
     dragged = tab.value(POSE)
     assert np.abs(tab.picture() - image).mean() > 0.01, "dragging turns the scene"
-    target = "(p => p.eye.map((x, i) => x + p.distance * p.axes().forward[i]))(nexwarp.pose)"
-    assert tab.value(target) == pytest.approx(tab.value(target.replace("(nexwarp.pose)", "(nexwarp.start_)")), abs=1e-4)
+    assert tab.value(TARGET) == pytest.approx(tab.value(TARGET.replace("(nexwarp.pose)", "(nexwarp.start_)")), abs=1e-4)
     page.mouse.wheel(0, 200)
     tab.wait(f"nexwarp.pose.distance > {dragged[5]} * 1.2")
     page.keyboard.press("Home")
@@ -209,34 +186,32 @@ def test_controls_modes_links_and_sizes(tab, site):
     assert tab.value("nexwarp.mode") == "normals" and page.input_value("#mode") == "normals"
 
     assert not tab.errors
-    own = [url for url in tab.requests if not url.startswith((site.url, "data:", "blob:"))]
+    own = [url for url in tab.requests if not url.startswith((URL, "data:", "blob:"))]
     assert not own, "no request leaves the page's own origin"
 
 
 @pytest.mark.parametrize("renderer", ["baked", "webgpu"])
-def test_a_double_click_turns_to_the_surfel_there(browser, site, renderer):
-    with browser.browser_type.launch(executable_path=CHROMIUM, args=[*FLAGS, *WEBGPU]) as other:
-        tab = Tab(other)
-        tab.open(f"{site.url}?renderer={renderer}")
-        hits = tab.value("""(async () => {
-            const {width, height} = nexwarp.canvas, hits = [];
-            for (let y = 8; y < height; y += 16) for (let x = 8; x < width; x += 16) {
-                const hit = await nexwarp.renderer.pick(x, y);
-                if (hit) hits.push([x, y, ...hit.position]);
-            }
-            return hits;
-        })()""")
-        x, y, *position = max(hits, key=lambda hit: abs(hit[0] - 100) + abs(hit[1] - 75))
-        tab.page.mouse.dblclick(x, y)
-        # Picking waits for a frame, so the flight to the surfel may begin later.
-        target = "(p => p.eye.map((x, i) => x + p.distance * p.axes().forward[i]))(nexwarp.pose)"
-        tab.wait(f"Math.hypot(...{target}.map((x, i) => x - {position}[i])) < 0.01 * Math.hypot(...{position})")
-        assert not tab.errors
+def test_a_double_click_turns_to_the_surfel_there(open_tab, renderer):
+    tab = open_tab(webgpu=True)
+    tab.open(f"?renderer={renderer}")
+    hits = tab.value("""(async () => {
+        const {width, height} = nexwarp.canvas, hits = [];
+        for (let y = 8; y < height; y += 16) for (let x = 8; x < width; x += 16) {
+            const hit = await nexwarp.renderer.pick(x, y);
+            if (hit) hits.push([x, y, ...hit.position]);
+        }
+        return hits;
+    })()""")
+    x, y, *position = max(hits, key=lambda hit: abs(hit[0] - 100) + abs(hit[1] - 75))
+    tab.page.mouse.dblclick(x, y)
+    # Picking waits for a frame, so the flight to the surfel may begin later.
+    tab.wait(f"Math.hypot(...{TARGET}.map((x, i) => x - {position}[i])) < 0.01 * Math.hypot(...{position})")
+    assert not tab.errors
 
 
-def test_touch_on_a_phone(browser, site):
-    tab = Tab(browser, 360, 640, has_touch=True, is_mobile=True, device_scale_factor=1)
-    tab.open(site.url)  # no WebGPU in this browser: the page chooses the baked scene
+def test_touch_on_a_phone(open_tab):
+    tab = open_tab(360, 640, has_touch=True, is_mobile=True, device_scale_factor=1)
+    tab.open()  # no WebGPU in this browser: the page chooses the baked scene
     assert "baked" in tab.page.inner_text("#status")
     client = tab.context.new_cdp_session(tab.page)
 
@@ -263,20 +238,22 @@ def test_touch_on_a_phone(browser, site):
     tools = tab.page.locator("#tools button:visible")
     assert all(tools.nth(i).bounding_box()["height"] >= 40 for i in range(tools.count()))
     assert not tab.errors
-    tab.context.close()
+
+
+def header_of(content: bytes) -> dict[str, Any]:
+    header: dict[str, Any] = json.loads(content[16 : 16 + struct.unpack("<I", content[12:16])[0]])
+    return header
 
 
 def rebuilt(content: bytes, **changes: Any) -> bytes:
     """A baked scene with another header."""
-    size = struct.unpack("<I", content[12:16])[0]
-    text = json.dumps({**json.loads(content[16 : 16 + size]), **changes}).encode()
-    return content[:12] + struct.pack("<I", len(text)) + text + content[16 + size :]
+    text = json.dumps({**header_of(content), **changes}).encode()
+    return content[:12] + struct.pack("<I", len(text)) + text + content[16 + struct.unpack("<I", content[12:16])[0] :]
 
 
 def inflated(content: bytes) -> bytes:
     """A baked scene whose sections promise 2^24 surfels of deflated zeros, 3 GB."""
-    size = struct.unpack("<I", content[12:16])[0]
-    header = json.loads(content[16 : 16 + size])
+    header = header_of(content)
     for section in header["sections"]:
         section["shape"] = [2**24 if n == header["surfels"] else n for n in section["shape"]]
         section["encoding"] = "deflate"
@@ -285,50 +262,46 @@ def inflated(content: bytes) -> bytes:
 
 def test_damaged_files_give_one_line(tab, site):
     """What scenes have in common with baked ones is tried in test_webgpu.py."""
-    good = site.files[baked_files.BAKED_FILE]
+    good = site[BAKED_FILE]
     picture = {"file": "../x", "width": 4, "height": 4, "scale": 1}
-    damaged: list[tuple[dict[str, bytes | None], str]] = [
-        ({baked_files.BAKED_FILE: good[:50]}, "the file ends before"),
-        ({baked_files.BAKED_FILE: b"GIF89a" + good[6:]}, "expected NXWBAKED at the start"),
-        ({baked_files.BAKED_FILE: rebuilt(good, surfels=41)}, "expected the sections that the header describes"),
-        ({baked_files.BAKED_FILE: rebuilt(good, atlas=picture)}, "atlas: expected a picture's file"),
-        ({baked_files.BAKED_FILE: rebuilt(good, sh_ranges=[1])}, "sh_ranges: expected three numbers"),
-        ({baked_files.ATLAS_FILE: b"no picture"}, "expected a picture"),
-        ({baked_files.BAKED_FILE: inflated(good)}, "expected sections that unpack to at most 134"),
-        ({baked_files.BAKED_FILE: None}, "WebGPU"),  # there is no baked scene: what is missing is WebGPU
-    ]
-    for files, words in damaged:
-        kept = site.files
-        site.files = {name: content for name, content in {**kept, **files}.items() if content is not None}
-        tab.page.goto(site.url)
+    for file, content, words in (
+        (BAKED_FILE, good[:50], "the file ends before"),
+        (BAKED_FILE, b"GIF89a" + good[6:], "expected NXWBAKED at the start"),
+        (BAKED_FILE, rebuilt(good, surfels=41), "expected the sections that the header describes"),
+        (BAKED_FILE, rebuilt(good, atlas=picture), "atlas: expected a picture's file"),
+        (BAKED_FILE, rebuilt(good, sh_ranges=[1]), "sh_ranges: expected three numbers"),
+        (ATLAS_FILE, b"no picture", "expected a picture"),
+        (BAKED_FILE, inflated(good), "expected sections that unpack to at most 134"),
+        (BAKED_FILE, None, "WebGPU"),  # there is no baked scene: what is missing is WebGPU
+    ):
+        tab.files = {name: data for name, data in {**site, file: content}.items() if data is not None}
+        tab.page.goto(URL)
         tab.wait("globalThis.nexwarp && nexwarp.state === 'failed'")
         assert words in tab.message and "\n" not in tab.message, (words, tab.message)
         assert not tab.page.is_visible("#loading")
-        site.files = kept
 
 
 def test_the_live_demo_of_the_documentation(tab):
     folder = Path(__file__).parents[3] / "docs" / "demo_page"
     files = {file.name: file.read_bytes() for file in folder.iterdir()}
     assert sum(map(len, files.values())) < 3e6
-    with Site({**static_files(), **files}) as site:
-        tab.open(f"{site.url}?renderer=baked")
-        assert tab.picture().std() > 0.1 and not tab.errors
-        header, _ = read_sections(files[SCENE_FILE])
-        assert header["surfels"] == tab.value("nexwarp.renderer.info.surfels")
+    tab.files = {**static_files(), **files}
+    tab.open("?renderer=baked")
+    assert tab.picture().std() > 0.1 and not tab.errors
+    header, _ = read_sections(files[SCENE_FILE])
+    assert header["surfels"] == tab.value("nexwarp.renderer.info.surfels")
 
 
 @pytest.mark.slow
-def test_the_exact_renderer_in_the_page(browser, site):
-    with browser.browser_type.launch(executable_path=CHROMIUM, args=[*FLAGS, *WEBGPU]) as other:
-        tab = Tab(other, 160, 120)
-        tab.open(f"{site.url}?renderer=webgpu")
-        assert "exact" in tab.page.inner_text("#status")
-        image = tab.picture()
-        tab.page.keyboard.press("]")
-        tab.wait(FINISHED)
-        assert np.abs(tab.picture() - image).mean() > 0.01
-        assert not tab.errors
-        # Software draws the baked scene faster: without a wish, the page takes it.
-        tab.open(site.url)
-        assert "baked" in tab.page.inner_text("#status")
+def test_the_exact_renderer_in_the_page(open_tab):
+    tab = open_tab(160, 120, webgpu=True)
+    tab.open("?renderer=webgpu")
+    assert "exact" in tab.page.inner_text("#status")
+    image = tab.picture()
+    tab.page.keyboard.press("]")
+    tab.wait(FINISHED)
+    assert np.abs(tab.picture() - image).mean() > 0.01
+    assert not tab.errors
+    # Software draws the baked scene faster: without a wish, the page takes it.
+    tab.open()
+    assert "baked" in tab.page.inner_text("#status")

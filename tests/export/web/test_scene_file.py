@@ -13,8 +13,8 @@ from nexwarp.export.web.quantise import CHUNK, encode_chunks, encode_limits, enc
 from nexwarp.export.web.scene_file import SceneData, encode_scene
 from nexwarp.model.detail_limits import NEVER
 from nexwarp.model.options import RenderOptions
-from tests.export.web.scene_reader import decode_chunks, decode_limits, decode_quats, read_sections, read_surfels
-from tests.export.web.support import named_cameras, web_model
+from tests.export.web import support
+from tests.export.web.support import named_cameras, read_sections, read_surfels, web_model
 
 
 @cache
@@ -58,7 +58,7 @@ def test_values_in_chunks_return_within_half_a_step():
         codes, ranges = encode_chunks(values, dtype)
         steps = np.repeat(ranges[..., 1], CHUNK, axis=0)[: len(values)]
         rounding = 2e-7 * np.abs(values).max(0)
-        assert (np.abs(decode_chunks(codes, ranges) - values) <= 0.5 * steps * 1.001 + 2 * rounding).all()
+        assert (np.abs(support.decode_chunks(codes, ranges) - values) <= 0.5 * steps * 1.001 + 2 * rounding).all()
 
 
 def test_rotations_return_the_same_surfel():
@@ -66,7 +66,7 @@ def test_rotations_return_the_same_surfel():
     quats = rng.standard_normal((2000, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     code, swapped = encode_quats(quats)
-    expected, actual = (_axes(x) for x in (quats, decode_quats(code).astype(np.float64)))
+    expected, actual = (_axes(x) for x in (quats, support.decode_quats(code).astype(np.float64)))
     u, v = np.where(swapped[:, None, None], expected[:, [1, 0]], expected[:, :2]).transpose(1, 0, 2)
     for axis, wanted in ((actual[:, 0], u), (actual[:, 1], v), (actual[:, 2], expected[:, 2])):
         # Axes are lines: the surfel is the same with an axis reversed.
@@ -89,8 +89,10 @@ def _axes(quats: np.ndarray) -> np.ndarray:
 def test_detail_limits_keep_their_ends():
     limits = np.array([[0.0, NEVER], [1e-3, 2.0], [0.5, 3.0]], np.float32)
     codes, scale = encode_limits(limits)
-    np.testing.assert_allclose(decode_limits(codes, scale), limits, rtol=1e-4)
-    assert decode_limits(codes, scale)[0, 0] == 0 and decode_limits(codes, scale)[0, 1] == np.float32(NEVER)
+    np.testing.assert_allclose(support.decode_limits(codes, scale), limits, rtol=1e-4)
+    assert support.decode_limits(codes, scale)[0, 0] == 0 and support.decode_limits(codes, scale)[0, 1] == np.float32(
+        NEVER
+    )
 
 
 def test_the_morton_order_is_a_permutation_of_neighbours():

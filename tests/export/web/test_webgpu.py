@@ -1,12 +1,10 @@
 """The WebGPU renderer in Chromium, on SwiftShader, against `Model.render`; skipped without Chromium."""
 
-import base64
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -15,7 +13,7 @@ from nexwarp.export.web.export import static_files
 from nexwarp.export.web.scene_file import encode_scene
 from nexwarp.model.options import RenderOptions
 from nexwarp.viewer.modes import facing_normals, id_colours
-from tests.export.web.support import CHROMIUM, WEBGPU, Site, named_cameras, psnr, web_model
+from tests.export.web.support import CHROMIUM, URL, WEBGPU, Tab, entry_of, named_cameras, psnr, web_model
 from tests.export.web.test_scene_file import damaged
 from tests.scenes import make_camera, make_surfels, random_scene
 from tests.tolerances import FLIPS, WEB_PSNR, assert_close, assert_same_ids
@@ -40,14 +38,9 @@ OPEN = """async ([file, settings, canvas]) => {
     await renderer.load(file);
 }"""
 RENDER = """async ([camera, options, names]) => {
-    const base64 = (array) => {
-        let text = "";
-        for (const byte of new Uint8Array(array.buffer)) text += String.fromCharCode(byte);
-        return btoa(text);
-    };
     const frame = await renderer.render(camera, options);
     const buffers = {};
-    for (const name of names) buffers[name] = base64(await renderer.read(name));
+    for (const name of names) buffers[name] = Array.from(await renderer.read(name));
     return [frame.entries, buffers];
 }"""
 READ = """async (file) => {
@@ -68,85 +61,69 @@ CASES: dict[str, dict[str, Any]] = {
         "options": RenderOptions(max_hits=3, clamp_texture=True, background=(0.5, 0.2, 0.1)),
     },
     "no hits": {"options": RenderOptions(max_hits=0)},
-    "1 hit, degree 1": {"features": 1, "texture_degree": 1, "hidden_layers": 1, "options": RenderOptions(max_hits=1)},
+    "1 hit, degree 1": {"features": 1, "sh_degree": 1, "hidden_layers": 1, "options": RenderOptions(max_hits=1)},
     "no hidden layers, degree 2": {"features": 8, "hidden_layers": 0, "options": RenderOptions(sh_degree=2)},
     "no limits, mean exposure": {"options": RenderOptions(detail_limits=False, exposure="mean")},
 }
 
 
-@dataclass
-class Tab:
-    """A browser's page with the modules, the site that serves it, and its errors."""
+class RendererTab(Tab):
+    """A page with the renderer's modules."""
 
-    page: Any
-    site: Site
-    errors: list[str]
+    def load(self, model: nw.Model, *, quality: str = "full", canvas: bool = False, **settings: Any) -> nw.Camera:
+        """Load a model into a new renderer; its file has the camera of `web_model`, which is returned."""
+        camera = web_model()[1]
+        file = encode_scene(model, named_cameras(camera), quality=quality, poster=b"picture" if canvas else None)
+        self.files["scene.nxw"] = file
+        self.value(OPEN, ["scene.nxw", settings, canvas])
+        return camera
 
-    def load(self, content: bytes, *, canvas: bool = False, **settings: Any) -> None:
-        """Load a scene file's content into a new renderer."""
-        self.site.files["scene.nxw"] = content
-        self.page.evaluate(OPEN, ["scene.nxw", settings, canvas])
-
-    def render(self, camera: nw.Camera, *names: str, **options: Any) -> tuple[int, dict[str, torch.Tensor]]:
-        """Render; returns the number of list entries, and "image" and further buffers by name, (H, W, C)."""
-        names = ("image", *names)
-        entries, buffers = self.page.evaluate(RENDER, [entry_of(camera), options, names])
+    def render(self, camera: nw.Camera, *names: str, **options: Any) -> dict[str, torch.Tensor]:
+        """Render; returns "image" and further buffers by name, (H, W, C), and the number of list "entries"."""
+        entries, buffers = self.value(RENDER, [entry_of(camera), options, ["image", *names]])
         size = (camera.height, camera.width, -1)
-        arrays = {
-            name: np.frombuffer(base64.b64decode(text), np.int32 if name == "ids" else np.float32).copy()
-            for name, text in buffers.items()
-        }
-        tensors = {name: torch.from_numpy(array).reshape(size) for name, array in arrays.items() if array.size}
-        tensors["image"] = tensors["image"][..., :3].contiguous()
-        return entries, tensors
+        kinds = {name: torch.int32 if name == "ids" else torch.float32 for name, values in buffers.items() if values}
+        tensors = {name: torch.tensor(buffers[name], dtype=kind).reshape(size) for name, kind in kinds.items()}
+        return tensors | {"image": tensors["image"][..., :3].contiguous(), "entries": torch.tensor(entries)}
 
 
 @pytest.fixture(scope="module")
-def tab() -> Iterator[Tab]:
+def tab() -> Iterator[RendererTab]:
     api = pytest.importorskip("playwright.sync_api", reason="drives Chromium (extra `dev`)")
-    errors: list[str] = []
-    with Site({**static_files(), "index.html": PAGE.encode()}) as site, api.sync_playwright() as playwright:
+    with api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *WEBGPU])
-        page = browser.new_page()
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.goto(site.url)
-        page.wait_for_function("window.nexwarp")
-        yield Tab(page, site, errors)
+        tab = RendererTab(browser, {**static_files(), "index.html": PAGE.encode()})
+        tab.page.goto(URL)
+        tab.page.wait_for_function("window.nexwarp")
+        yield tab
         browser.close()
 
 
 @pytest.fixture
 def default(tab) -> tuple[nw.Model, nw.Camera]:
     """The default model, loaded bit for bit in single precision, and its camera."""
-    model, camera = web_model()
-    tab.load(encode_scene(model, named_cameras(camera), quality="full"), half=False)
-    return model, camera
-
-
-def entry_of(camera: nw.Camera) -> dict[str, object]:
-    """A camera as the page takes it."""
-    K = [camera.fx, camera.fy, camera.cx, camera.cy]
-    size = {"width": camera.width, "height": camera.height, "near": camera.near}
-    return {"viewmat": camera.viewmat.flatten().tolist(), "K": K, **size}
+    model, _ = web_model()
+    return model, tab.load(model, half=False)
 
 
 @torch.no_grad()
 def test_the_canvas_shows_the_model(tab):
     model, camera = web_model()
     expected = model.render(camera)
-    tab.load(encode_scene(model, named_cameras(camera), quality="full", poster=b"picture"), canvas=True)
-    info = tab.page.evaluate("renderer.info")
+    tab.load(model, canvas=True)
+    info = tab.value("renderer.info")
     assert info["textured"] and info["surfels"] == len(model.surfels)
-    assert tab.page.evaluate("stages") == ["header", "geometry", "grid", "done"]
-    _, out = tab.render(camera, "ids")
-    assert psnr(out["image"].numpy(), expected.image.numpy()) > WEB_PSNR["full"]
-    pixels = tab.page.evaluate("[...target.getContext('2d').getImageData(0, 0, 37, 27).data]")
-    shown = np.array(pixels, np.float32).reshape(camera.height, camera.width, 4)[..., :3] / 255
-    assert np.abs(shown - out["image"].numpy().clip(0, 1)).max() < 1.1 / 255
-    picked = tab.page.evaluate("renderer.pick(18, 13)")
+    assert tab.value("stages") == ["header", "geometry", "grid", "done"]
+    out = tab.render(camera, "ids")
+    assert psnr(out["image"], expected.image) > WEB_PSNR["full"]
+    pixels = tab.value("[...target.getContext('2d').getImageData(0, 0, 37, 27).data]")
+    shown = torch.tensor(pixels).reshape(camera.height, camera.width, 4)[..., :3] / 255
+    assert (shown - out["image"].clip(0, 1)).abs().max() < 1.1 / 255
+    picked = tab.value("renderer.pick(18, 13)")
     assert picked["id"] == out["ids"][13, 18, 0]
     assert picked["depth"] == pytest.approx(expected.depths[13, 18, 0].item(), rel=1e-4)
+    tab.load(model, quality="quantised")
+    assert psnr(tab.render(camera)["image"], expected.image) > WEB_PSNR["quantised"]
     assert tab.errors == []
 
 
@@ -157,12 +134,12 @@ def test_the_canvas_shows_the_model(tab):
 def test_all_buffers_are_those_of_the_model(tab, case):
     model, camera = web_model(**CASES[case])
     expected = model.render(camera)
-    tab.load(encode_scene(model, named_cameras(camera), quality="full"), half=False)
-    _, out = tab.render(camera, "ids", "depths", "weights", "colors")
+    tab.load(model, half=False)
+    out = tab.render(camera, "ids", "depths", "weights", "colors")
     buffers = {name: out[name] for name in ("image", "depths", "weights") if name in out}
     buffers["alpha"] = out["colors"][..., 3].contiguous()
     for mode in ("plain", "textured"):
-        buffers[mode] = tab.render(camera, mode=mode)[1]["image"]
+        buffers[mode] = tab.render(camera, mode=mode)["image"]
     if model.options.max_hits:
         assert_same_ids(out["ids"], expected.ids, name="ids", allow_flips=FLIPS)
     for name, buffer in buffers.items():
@@ -175,11 +152,10 @@ def test_hits_before_the_near_plane_do_not_count(tab, default):
     """Surfels lie before the plane, behind it and across it."""
     model, camera = default
     depths = model.render(camera).depths[..., 0]
-    near = float(depths[depths > 0].median())
-    camera = nw.Camera(camera.viewmat, camera.K, camera.width, camera.height, near)
-    expected, everything = model.render(camera).image, tab.render(default[1])[1]["image"]
-    assert (everything - expected).abs().max() > 0.1
-    assert_close(tab.render(camera)[1]["image"], expected, kind="value", name="image", allow_flips=FLIPS)
+    cut = replace(camera, near=float(depths[depths > 0].median()))
+    expected = model.render(cut).image
+    assert (tab.render(camera)["image"] - expected).abs().max() > 0.1
+    assert_close(tab.render(cut)["image"], expected, kind="value", name="image", allow_flips=FLIPS)
 
 
 @torch.no_grad()
@@ -197,31 +173,23 @@ def test_of_equal_weights_the_nearer_hit_comes_first(tab):
     surfels, camera = make_surfels(scene), make_camera(scene)
     surfels.logit_opacities.copy_(torch.cat([far, near]))
     model = nw.Model(surfels, None, options=RenderOptions(max_hits=2))
-    tab.load(encode_scene(model, named_cameras(camera), quality="full"))
-    _, out = tab.render(camera, "ids", "weights")
+    tab.load(model)
+    out = tab.render(camera, "ids", "weights")
     equal = out["weights"][..., 0] == out["weights"][..., 1]
     assert equal.sum() > 10
     assert (out["ids"][equal][:, 0] >= side**2).all()
 
 
-@torch.no_grad()
-def test_a_quantised_file_is_within_its_bound(tab):
-    model, camera = web_model()
-    tab.load(encode_scene(model, named_cameras(camera)))
-    _, out = tab.render(camera)
-    assert psnr(out["image"].numpy(), model.render(camera).image.numpy()) > WEB_PSNR["quantised"]
-
-
 def test_lists_grow_and_pictures_repeat_bit_for_bit(tab, default):
     _, camera = default
-    entries, expected = tab.render(camera)
-    assert entries > 16
+    expected = tab.render(camera)
+    assert expected["entries"] > 16
     tab.render(camera, mode="depth")
-    assert torch.equal(tab.render(camera)[1]["image"], expected["image"])
-    tab.page.evaluate("renderer.capacity = 16")
-    again, out = tab.render(camera)
-    assert again == entries and tab.page.evaluate("renderer.capacity") >= entries
-    assert torch.equal(out["image"], expected["image"])
+    assert torch.equal(tab.render(camera)["image"], expected["image"])
+    tab.value("renderer.capacity = 16")
+    again = tab.render(camera)
+    assert tab.value("renderer.capacity") >= again["entries"]
+    assert all(torch.equal(again[name], expected[name]) for name in ("image", "entries"))
 
 
 @torch.no_grad()
@@ -234,9 +202,9 @@ def test_modes_show_the_buffers_of_the_heaviest_hit(tab, default):
     pictures = {"ids": id_colours(ids) * hit, "normals": (0.5 + 0.5 * normals) * hit}
     pictures["alpha"] = expected.alpha[..., None].expand(*ids.shape, 3)
     for mode, picture in pictures.items():
-        shown = tab.render(camera, mode=mode)[1]["image"]
+        shown = tab.render(camera, mode=mode)["image"]
         assert_close(shown, picture.contiguous(), kind="value", name=mode, allow_flips=FLIPS)
-    depth, shown = expected.depths[..., 0], tab.render(camera, mode="depth")[1]["image"]
+    depth, shown = expected.depths[..., 0], tab.render(camera, mode="depth")["image"]
     low, high = depth[hit[..., 0]].quantile(torch.tensor([0.25, 0.75]))
     near, far = shown[hit[..., 0] & (depth <= low)], shown[hit[..., 0] & (depth >= high)]
     assert near[:, 1].mean() < far[:, 1].mean()  # violet to yellow
@@ -245,7 +213,7 @@ def test_modes_show_the_buffers_of_the_heaviest_hit(tab, default):
 @torch.no_grad()
 def test_ways_to_save_work_change_what_they_say(tab, default):
     model, camera = default
-    exact, coarse = tab.render(camera)[1]["image"], tab.render(camera, textureScale=0.5)[1]["image"]
+    exact, coarse = tab.render(camera)["image"], tab.render(camera, textureScale=0.5)["image"]
     # A pixel's own texel has 9,999 of 10,000 parts.
     assert (coarse[::2, ::2] - exact[::2, ::2]).abs().max() < 1e-3
     assert 1e-4 < (coarse - exact).abs().max()
@@ -256,7 +224,7 @@ def test_ways_to_save_work_change_what_they_say(tab, default):
     assert factors is not None
     second = (base * factors - out.colors[..., 1, :]) * out.weights[..., 1:]
     expected = out.image + second * (out.ids[..., 1:] >= 0)
-    image = tab.render(camera, leastWeight=1.0)[1]["image"]
+    image = tab.render(camera, leastWeight=1.0)["image"]
     assert_close(image, expected, kind="value", name="image", allow_flips=FLIPS)
 
 
@@ -264,14 +232,14 @@ def test_an_empty_scene_shows_the_background(tab):
     model, camera = web_model()
     empty = nw.Surfels({name: value[:0] for name, value in model.surfels.state_dict().items()})
     bare = nw.Model(empty, None, options=RenderOptions(background=(0.25, 0.5, 1.0)))
-    tab.load(encode_scene(bare, named_cameras(camera), quality="full"))
-    entries, out = tab.render(camera, "ids")
-    assert entries == 0 and (out["ids"] == -1).all()
+    tab.load(bare)
+    out = tab.render(camera, "ids")
+    assert out["entries"] == 0 and (out["ids"] == -1).all()
     assert torch.equal(out["image"], torch.tensor([0.25, 0.5, 1.0]).expand_as(out["image"]))
 
 
 def test_damaged_files_give_one_line(tab):
     for name, content in damaged().items():
-        tab.site.files["damaged.nxw"] = content
-        message = tab.page.evaluate(READ, f"damaged.nxw?{json.dumps(name)}")
+        tab.files["damaged.nxw"] = content
+        message = tab.value(READ, f"damaged.nxw?{json.dumps(name)}")
         assert message.startswith("SceneError: scene file: ") and "\n" not in message, (name, message)

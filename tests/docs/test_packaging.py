@@ -1,15 +1,24 @@
-"""The locks in requirements/ hold what pyproject.toml and constraints.txt say, with hashes; and the audit."""
+"""Packaging: an editable package is found from every folder; metadata, locks and audit are complete.
+
+The locks in requirements/ hold what pyproject.toml and constraints.txt say, with hashes.
+"""
 
 import importlib.util
 import json
 import re
+import shutil
+import subprocess
 import sys
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+import nexwarp
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -27,16 +36,57 @@ PLATFORMS = (
 )
 
 
+def script(name: str) -> Any:
+    """A module of .ci/."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / ".ci" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_an_editable_package_is_found_in_the_folder_above_the_clone(tmp_path: Path) -> None:
+    """The clone's folder is named as the package."""
+    pytest.importorskip("setuptools", reason="needs setuptools (extra dev)")
+    clone, site = tmp_path / "nexwarp", tmp_path / "site"
+    (clone / "nexwarp").mkdir(parents=True)
+    site.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, clone)
+    (clone / "nexwarp" / "__init__.py").write_text("render = 'the function'\n")
+    (clone / "nexwarp" / "py.typed").touch()
+    code = f"import setuptools.build_meta as b; b.build_editable({str(site)!r})"
+    subprocess.run([sys.executable, "-c", code], cwd=clone, check=True, capture_output=True)
+    (wheel,) = site.glob("*.whl")
+    with zipfile.ZipFile(wheel) as content:
+        content.extractall(site)
+    for folder in (tmp_path, clone, clone / "nexwarp", site):
+        # Without the site-packages of this environment (-S), which hold another nexwarp.
+        code = f"import site; site.addsitedir({str(site)!r}); import nexwarp; print(nexwarp.render)"
+        done = subprocess.run([sys.executable, "-S", "-c", code], cwd=folder, capture_output=True, text=True, env={})
+        assert (done.stdout, done.stderr) == ("the function\n", ""), folder
+
+
+def test_the_version_has_one_value() -> None:
+    written = re.search(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.M)
+    cited = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.M)
+    assert written is not None and cited is not None
+    assert written[1] == cited[1] == nexwarp.__version__
+
+
+def test_the_readme_on_pypi_links_to_files_that_exist() -> None:
+    text = script("package").absolute_links((ROOT / "README.md").read_text(encoding="utf-8"))
+    targets = re.findall(r"\]\(([^)\s]+)\)", text)
+    assert targets and all(re.match(r"https?://|#", target) for target in targets)
+    ours = re.findall(r"https://(?:raw\.)?github\w*\.com/nexwarp/nexwarp/(?:blob/)?main/([^)#\s]+)", text)
+    assert "docs/capture.jpg" in ours and all((ROOT / name).exists() for name in ours)
+
+
 def read_lock(name: str) -> list[tuple[Requirement, list[str]]]:
     """Requirements of a lock and their hashes."""
     text = (ROOT / "requirements" / f"{name}.txt").read_text(encoding="utf-8").replace("\\\n", " ")
     lines = [line.split(" --hash=") for line in text.splitlines() if line[:1].isalnum()]
     return [(Requirement(line[0]), [part.strip() for part in line[1:]]) for line in lines]
-
-
-def constraints() -> list[Requirement]:
-    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
-    return [Requirement(line) for line in lines if line and not line.startswith("#")]
 
 
 def asked() -> dict[str, list[Requirement]]:
@@ -68,7 +118,9 @@ def test_locks_are_the_constraints(python: str, platform: dict[str, str]) -> Non
     """On every Python and platform: the tested versions, and all that pyproject.toml asks for; else run .ci/lock.py."""
     versions = {"python_version": python, "python_full_version": f"{python}.20", "implementation_name": "cpython"}
     environment = {name: str(value) for name, value in default_environment().items()} | versions | platform
-    tested, extras = pinned(constraints(), environment), asked()
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    constraints = [Requirement(line) for line in lines if line and not line.startswith("#")]
+    tested, extras = pinned(constraints, environment), asked()
     for locks, wanted in ((LOCKS[:2], ("", *RUN_EXTRAS)), (LOCKS, tuple(extras))):
         lock = pinned([requirement for name in locks for requirement, _ in read_lock(name)], environment)
         differ = {key: lock[key] for key in lock.keys() & tested.keys() if lock[key] != tested[key]}
@@ -80,10 +132,7 @@ def test_locks_are_the_constraints(python: str, platform: dict[str, str]) -> Non
 
 def test_a_vulnerability_fails_the_audit() -> None:
     """And an audit that skipped everything is none."""
-    spec = importlib.util.spec_from_file_location("audit", ROOT / ".ci" / "audit.py")
-    assert spec is not None and spec.loader is not None
-    audit = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(audit)
+    audit = script("audit")
     bad = {"name": "numpy", "version": "1.0", "vulns": [{"id": "CVE-1", "fix_versions": ["1.1", "2.0"]}]}
     good = {"name": "torch", "version": "2.0", "vulns": []}
     skipped = {"name": "rich", "skip_reason": "no answer"}
