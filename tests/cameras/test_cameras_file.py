@@ -29,26 +29,19 @@ def test_cameras_come_back_exactly(tmp_path):
 
 ROWS = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 CAMERA = {"viewmat": ROWS, "K": [[9.0, 0.0, 4.0], [0.0, 9.0, 3.0], [0.0, 0.0, 1.0]], "width": 8, "height": 6}
+NEAR = CAMERA | {"near": 0.1}
+CHANGES = [{"near": "x"}, {"viewmat": ROWS[:3]}, {"viewmat": "text"}, {"viewmat": [[float("nan")] * 4] * 4}]
+CHANGES += [{"K": ROWS}, {"width": 0}]
 
 
 @pytest.mark.parametrize(
     "content",
     [
-        "",
-        "{",
-        "[1, 2]",
-        '{"train": [1]}',
-        '{"train": {"a": 3}}',
+        *("", "{", "[1, 2]", '{"train": [1]}', '{"train": {"a": 3}}'),
         json.dumps({"train": {"a": CAMERA}}),  # no near
-        json.dumps({"train": {"a": CAMERA | {"near": "x"}}}),
-        json.dumps({"train": {"a": CAMERA | {"near": 0.1, "viewmat": ROWS[:3]}}}),
-        json.dumps({"train": {"a": CAMERA | {"near": 0.1, "viewmat": "text"}}}),
-        json.dumps({"train": {"a": CAMERA | {"near": 0.1, "K": ROWS}}}),
-        json.dumps({"train": {"a": CAMERA | {"near": 0.1, "width": 0}}}),
-        json.dumps({"train": {"../a": CAMERA | {"near": 0.1}}}),
-        json.dumps({"train": {"C:/a": CAMERA | {"near": 0.1}}}),
-        json.dumps({"validation": {"a": CAMERA | {"near": 0.1}}}),
-        json.dumps({"train": {"a": CAMERA | {"near": 0.1, "viewmat": [[float("nan")] * 4] * 4}}}),
+        *(json.dumps({"train": {"a": NEAR | change}}) for change in CHANGES),
+        *(json.dumps({"train": {name: NEAR}}) for name in ("../a", "C:/a")),
+        json.dumps({"validation": {"a": NEAR}}),
     ],
 )
 def test_malformed_cameras(tmp_path, content):

@@ -43,10 +43,9 @@ def test_transforms_come_back(tmp_path: Path) -> None:
         assert_same(after[name], before[name])
     data = json.loads((tmp_path / "new" / "transforms.json").read_text())
     assert data["train_filenames"] == names[1:] and data["val_filenames"] == data["test_filenames"] == names[:1]
-    for path_camera, name in zip(
-        load_camera_path(tmp_path / "new" / "transforms.json", 0.1).cameras, names, strict=True
-    ):
-        assert_same(path_camera, before[name])
+    path = load_camera_path(tmp_path / "new" / "transforms.json", 0.1)
+    for mine, theirs in zip(path.cameras, before.values(), strict=True):
+        assert_same(mine, theirs)
 
 
 @pytest.mark.parametrize("centred", [True, False])
@@ -132,10 +131,6 @@ def entry(**changes: Any) -> dict[str, Any]:
     return PATH | {"camera_path": [ENTRY, {k: v for k, v in (ENTRY | changes).items() if v is not None}]}
 
 
-def frame(**changes: Any) -> dict[str, Any]:
-    return SCENE | {"frames": [{k: v for k, v in (FRAME | changes).items() if v is not None}]}
-
-
 SINGULAR = torch.diag(torch.tensor([1.0, 1.0, 0.0, 1.0])).flatten().tolist()
 BAD = [
     ("{", "expected JSON, could not parse it"),
@@ -158,7 +153,7 @@ BAD = [
     (entry(camera_to_world=[math.nan, *FLAT[1:]]), r"camera_path\[1\]: camera_to_world: expected finite numbers"),
     (entry(camera_to_world=[2.0, *FLAT[1:]]), r"camera_path\[1\]: viewmat: expected an orthonormal rotation"),
     (entry(camera_to_world=[-1.0, *FLAT[1:]]), r"camera_path\[1\]: viewmat: expected a rotation with determinant 1"),
-    (frame(transform_matrix=None), r"frames\[0\]: expected the key transform_matrix, found none"),
+    (SCENE | {"frames": [{"file_path": "a.png"}]}, r"frames\[0\]: expected the key transform_matrix, found none"),
     (SCENE | {"camera_model": "EQUIRECTANGULAR"}, "camera_model: expected one of PINHOLE"),
     (SCENE | {"applied_transform": [[0.0] * 4] * 3}, "applied_transform: expected an invertible pose"),
     (SCENE | {"frames": [FRAME, FRAME]}, r"frames\[1\]\.file_path: expected a name of its own, got 'a.png' again"),
@@ -177,16 +172,16 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path, data: Any, message: s
 
 
 def test_other_wrong_inputs(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no\.json: no such file, expected cameras as JSON"):
-        load_camera_path(tmp_path / "no.json")
     one = cameras(1)[0]
     other = Camera(one.viewmat, one.K, 65, 48)
-    with pytest.raises(ValueError, match="cameras: expected one size, got 64x48 and 65x48"):
-        save_camera_path(tmp_path / "a.json", [one, other])
-    with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
-        save_camera_path(tmp_path / "a.json", [])
-    with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
-        save_transforms(tmp_path / "a.json", {})
-    with pytest.raises(ValueError, match="fps: expected more than 0 frames a second, got 0"):
-        save_camera_path(tmp_path / "a.json", [one], fps=0)
+    with pytest.raises(FileNotFoundError, match=r"no\.json: no such file, expected cameras as JSON"):
+        load_camera_path(tmp_path / "no.json")
+    for save, given, message in (
+        (save_camera_path, ([one, other],), "cameras: expected one size, got 64x48 and 65x48"),
+        (save_camera_path, ([],), "cameras: expected at least one, got none"),
+        (save_transforms, ({},), "cameras: expected at least one, got none"),
+        (save_camera_path, ([one], 0), "fps: expected more than 0 frames a second, got 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            save(tmp_path / "a.json", *given)
     assert not list(tmp_path.iterdir())

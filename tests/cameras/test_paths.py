@@ -1,6 +1,8 @@
 """Laws of camera paths."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,6 +50,12 @@ def moved(each: Camera, motion: tuple[torch.Tensor, torch.Tensor, float]) -> Cam
     return Camera(viewmat, each.K, each.width, each.height, each.near)
 
 
+def assert_seen(each: Camera, target: torch.Tensor) -> None:
+    """A camera has a point in front of it, at its principal point."""
+    x, y, depth = INTRINSICS @ (each.viewmat[:3, :3] @ target + each.viewmat[:3, 3])
+    assert depth > 1.0 and (x / depth).item() == pytest.approx(33.0) and (y / depth).item() == pytest.approx(20.0)
+
+
 def test_focus_is_where_the_axes_meet() -> None:
     target = torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64)
     cameras = [camera(target + 3 * torch.randn(3), target) for _ in range(5)]
@@ -58,10 +66,7 @@ def test_every_camera_looks_at_the_focus_upright() -> None:
     cameras = ring()
     up = up_direction(cameras)
     for each in ellipse(cameras, 30):
-        x, y, depth = INTRINSICS @ (each.viewmat[:3, :3] @ focus(cameras) + each.viewmat[:3, 3])
-        assert depth > 1.0
-        assert (x / depth).item() == pytest.approx(33.0, abs=1e-9)
-        assert (y / depth).item() == pytest.approx(20.0, abs=1e-9)
+        assert_seen(each, focus(cameras))
         right, down = each.viewmat[0, :3], each.viewmat[1, :3]
         assert abs(right @ up) < 1e-12 and down @ up < 0
         rotation = each.viewmat[:3, :3]
@@ -99,35 +104,14 @@ def test_up_is_across_the_right_axes_however_cameras_are_tilted() -> None:
     assert up_direction([]).tolist() == [0.0, -1.0, 0.0]
 
 
-def test_an_upright_wall_of_cameras_gives_an_upright_ellipse() -> None:
+def test_cameras_on_a_wall_or_a_line_give_a_path_along_it() -> None:
     target = torch.tensor([0.0, 4.0, 0.0])
     places = [torch.tensor([float(x), 0.0, float(z)]) for x in range(-3, 4) for z in range(-1, 2)]
-    path = ellipse([camera(place, target) for place in places], 40)
-    assert positions(path)[:, 1].abs().max() < 1e-9
-    assert positions(path)[:, 2].max() > 0.5
-
-
-def test_centres_on_a_line_give_a_path_along_it() -> None:
-    target = torch.tensor([0.0, 4.0, 0.0])
+    path = positions(ellipse([camera(place, target) for place in places], 40))
+    assert path[:, 1].abs().max() < 1e-9 and path[:, 2].max() > 0.5
     path = positions(ellipse([camera(torch.tensor([x, 0.0, 1.0]), target) for x in (-2.0, -1.0, 2.0)], 20))
     assert (path[:, 1:] - torch.tensor([0.0, 1.0])).abs().max() < 1e-9
     assert path[:, 0].max().item() == pytest.approx(1.7) and path[:, 0].min().item() == pytest.approx(-1.9)
-
-
-def test_degenerate_cameras_are_refused() -> None:
-    origin, ahead = torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])
-    one = camera(origin, ahead)
-    with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
-        ellipse([])
-    for cameras in ([one], [one, one], [one, camera(origin + 1, ahead + 1)]):
-        with pytest.raises(ValueError, match="cameras: expected two or more with axes that are not parallel"):
-            ellipse(cameras)
-    with pytest.raises(ValueError, match="cameras: expected at least two distinct centres"):
-        ellipse([camera(ahead, 2 * ahead), camera(ahead, ahead + torch.tensor([1.0, 0.0, 0.0]))])
-    with pytest.raises(ValueError, match="count: expected at least 1, got 0"):
-        ellipse(ring(), 0)
-    with pytest.raises(ValueError, match="up: expected a direction across the line"):
-        look_at(UP, 3 * UP, UP)
 
 
 def row(count: int = 15, bend: float = 0.3) -> list[Camera]:
@@ -159,8 +143,7 @@ def test_spiral_winds_within_the_cameras() -> None:
 def test_spiral_looks_at_the_focus_or_along_the_mean_direction() -> None:
     cameras = row()
     for each in spiral(cameras, 12):
-        x, y, depth = INTRINSICS @ (each.viewmat[:3, :3] @ focus(cameras) + each.viewmat[:3, 3])
-        assert depth > 1.0 and (x / depth).item() == pytest.approx(33.0) and (y / depth).item() == pytest.approx(20.0)
+        assert_seen(each, focus(cameras))
     for bend in (0.0, -0.5):  # parallel axes, axes that part
         cameras = row(bend=bend)
         forward = torch.stack([each.viewmat[2, :3] for each in cameras]).mean(0)
@@ -168,7 +151,10 @@ def test_spiral_looks_at_the_focus_or_along_the_mean_direction() -> None:
             assert_close(each.viewmat[2, :3], forward / forward.norm(), kind="value", name="forward")
 
 
-@pytest.mark.parametrize(("make", "cameras_of"), [(ellipse, ring), (spiral, row), (interpolate, row)])
+PATHS = pytest.mark.parametrize(("make", "cameras_of"), [(ellipse, ring), (spiral, row), (interpolate, row)])
+
+
+@PATHS
 @pytest.mark.parametrize("scale", [1.0, 0.01, 50.0])
 def test_paths_move_and_scale_with_the_cameras(make, cameras_of, scale: float) -> None:
     cameras, motion = cameras_of(), similarity(scale)
@@ -178,7 +164,7 @@ def test_paths_move_and_scale_with_the_cameras(make, cameras_of, scale: float) -
         assert (mine.viewmat - theirs.viewmat).abs().max() < 1e-7 * max(scale, 1.0)
 
 
-@pytest.mark.parametrize(("make", "cameras_of"), [(ellipse, ring), (spiral, row), (interpolate, row)])
+@PATHS
 def test_paths_take_the_rest_from_the_first_camera(make, cameras_of, device: torch.device) -> None:
     path = make([each.to(device, torch.float32) for each in cameras_of()], 5)
     assert len(path) == 5
@@ -190,10 +176,6 @@ def test_paths_take_the_rest_from_the_first_camera(make, cameras_of, device: tor
 # Interpolation
 
 
-def nearest(path: list[Camera], target: Camera) -> float:
-    return min((each.viewmat - target.viewmat).abs().max().item() for each in path)
-
-
 def test_interpolation_passes_through_every_key_in_turn() -> None:
     cameras = ring(6)
     path = interpolate(cameras, 2001, keys=6)
@@ -201,7 +183,7 @@ def test_interpolation_passes_through_every_key_in_turn() -> None:
     assert all(error.min() < 2e-2 for error in errors)
     order = [error.argmin().item() for error in errors]
     assert order == sorted(order) and order[0] == 0 and order[-1] == 2000
-    assert nearest(path[:1], cameras[0]) < 1e-9 and nearest(path[-1:], cameras[-1]) < 1e-9
+    assert errors[0][0] < 1e-9 and errors[-1][-1] < 1e-9
 
 
 def test_interpolation_thins_many_cameras() -> None:
@@ -223,29 +205,35 @@ def test_interpolation_is_smooth() -> None:
     assert (rotations @ rotations.mT - torch.eye(3)).abs().max() < 1e-12
 
 
-def test_the_other_paths_refuse_degenerate_cameras() -> None:
-    one = camera(torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
-    with pytest.raises(ValueError, match=r"expected cameras that face one way, .* an ellipse suits"):
-        spiral(ring(height=0.6))
-    for cameras in ([one], [one, one, one]):
-        with pytest.raises(ValueError, match="cameras: expected at least two distinct"):
-            spiral(cameras)
-        with pytest.raises(ValueError, match="cameras: expected at least two distinct ones, got"):
-            interpolate(cameras)
-    for make in (spiral, interpolate):
-        with pytest.raises(ValueError, match="cameras: expected at least one, got none"):
-            make([])
-        with pytest.raises(ValueError, match="count: expected at least 1, got 0"):
-            make(row(), 0)
-    with pytest.raises(ValueError, match="keys: expected at least 2, got 1"):
-        interpolate(row(), 5, keys=1)
+ONE = camera(torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
+ASIDE = camera(torch.zeros(3), torch.tensor([1.0, 0.0, 0.0]))
+PARALLEL = "cameras: expected two or more with axes that are not parallel"
+
+
+@pytest.mark.parametrize(
+    ("make", "given", "message"),
+    [
+        *((make, [[]], "cameras: expected at least one, got none") for make in (ellipse, spiral, interpolate)),
+        *((make, [[ONE, ASIDE], 0], "count: expected at least 1, got 0") for make in (ellipse, spiral, interpolate)),
+        *((ellipse, [each], PARALLEL) for each in ([ONE], [ONE, ONE])),
+        (ellipse, [[ONE, ASIDE]], "cameras: expected at least two distinct centres"),
+        *((spiral, [each], "cameras: expected at least two distinct centres") for each in ([ONE], 3 * [ONE])),
+        *((interpolate, [each], "cameras: expected at least two distinct ones, got") for each in ([ONE], 3 * [ONE])),
+        (spiral, [[ONE, camera(torch.ones(3), torch.zeros(3)), ASIDE]], r"that face one way, .* an ellipse suits"),
+        (interpolate, [[ONE, ASIDE], 5, 1], "keys: expected at least 2, got 1"),
+        (look_at, [UP, 3 * UP, UP], "up: expected a direction across the line"),
+    ],
+)
+def test_degenerate_cameras_are_refused(make: Callable[..., Any], given: list[Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(*given)
 
 
 # Sizes
 
 
 def test_resized_camera_sees_the_same_from_top_to_bottom() -> None:
-    one = camera(torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))  # 64 x 48, fx 90, fy 95, cx 33, cy 20
+    one = ONE  # 64 x 48, fx 90, fy 95, cx 33, cy 20
     wide = resized(one, 256, 96)
     assert (wide.width, wide.height, wide.fx, wide.fy) == (256, 96, 180.0, 190.0)
     assert wide.viewmat.equal(one.viewmat) and wide.near == one.near
@@ -291,8 +279,7 @@ def test_cameras_between_lie_on_the_way_to_a_neighbour_that_looks_alike() -> Non
 
 
 def test_a_camera_without_a_neighbour_stays() -> None:
-    lonely = camera(torch.tensor([0.0, 0, 0]), torch.tensor([0.0, 1, 0]))
-    other = camera(torch.tensor([1.0, 0, 0]), torch.tensor([1.0, -1, 0]))
-    for cameras in ([lonely], [lonely, other]):
+    away = camera(torch.tensor([1.0, 0, 0]), torch.tensor([1.0, -1, 0]))
+    for cameras in ([ONE], [ONE, away]):
         for old, new in zip(cameras, between(cameras, torch.Generator()), strict=True):
             assert_close(new.viewmat, old.viewmat, kind="value", name="viewmat")

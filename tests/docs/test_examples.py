@@ -51,6 +51,11 @@ def numbers(pattern: str, text: str) -> list[float]:
     return [float(x) for match in re.finditer(pattern, text) for x in match.groups()]
 
 
+def size_of(path: Path) -> tuple[int, int]:
+    with Image.open(path) as image:
+        return image.size
+
+
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_are_short_and_import_the_public_face_alone(path: Path) -> None:
     """They tell how to run them. What users copy is what `nexwarp.__all__` promises, not the package's rooms."""
@@ -105,7 +110,7 @@ def test_depth_and_normals_are_those_of_the_rendering(model: Path, tmp_path: Pat
             assert torch.equal(torch.from_numpy(values), getattr(rendering, name)), name
     names = {path.name for path in tmp_path.glob("*.png")}
     assert names == {"image.png", "mask.png", "expected_depth.png", "median_depth.png", "normals.png"}
-    assert all(Image.open(tmp_path / name).size == (camera.width, camera.height) for name in names)
+    assert all(size_of(tmp_path / name) == (camera.width, camera.height) for name in names)
 
 
 def test_frames_and_a_video_along_a_path_are_written(model: Path, tmp_path: Path) -> None:
@@ -113,7 +118,7 @@ def test_frames_and_a_video_along_a_path_are_written(model: Path, tmp_path: Path
     run("render_path", "--model", model, "--out", tmp_path / "frames", "--frames", 3)
     frames = sorted((tmp_path / "frames").iterdir())
     assert [path.name for path in frames] == [f"frame_{i:04d}.png" for i in range(3)]
-    assert {Image.open(path).size for path in frames} == {(48, 36)}
+    assert {size_of(path) for path in frames} == {(48, 36)}
     run("render_path", "--model", model, "--out", tmp_path / "around.mp4", "--frames", 3, "--height", 72, "--white")
     with av.open(str(tmp_path / "around.mp4")) as video:
         assert [(frame.width, frame.height) for frame in video.decode(video=0)] == [(96, 72)] * 3
