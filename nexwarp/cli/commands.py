@@ -1,25 +1,190 @@
-"""`nexwarp render`, `export`, `info` and `warmup`."""
+"""`nexwarp process`, `eval`, `render`, `export`, `view`, `info` and `warmup`."""
 
 import dataclasses
+import math
 import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import tyro
 from rich.console import Console
 
 from nexwarp.cli import display
-from nexwarp.cli.device import pick_device
-from nexwarp.cli.display import describe_exposures, device_name
-from nexwarp.cli.eval import figures
-from nexwarp.cli.options import Device_, Preset_, Run_, check_max_hits, option
+from nexwarp.cli.options import Device_, Flag_, Host_, Port_, Preset_, Run_, check_max_hits, option, pick_device
+from nexwarp.data import View
+from nexwarp.data.scene import SceneSource
+from nexwarp.data.sfm import SfmOptions, process
+from nexwarp.data.sfm.photos import FILMS
+from nexwarp.data.sfm.process import FRAMES, REPORT_FILE, video_identity
+from nexwarp.errors import MissingError, RunError, SceneError
+from nexwarp.io.json_files import READ_ERRORS, Json, read_object, write_json
+from nexwarp.model.model import Model
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.run import warmup
+from nexwarp.run.evaluate import check_metrics, evaluate
 from nexwarp.run.export import ExportOrder, export_run
-from nexwarp.run.folder import RENDERS_FOLDER, read_metrics
-from nexwarp.run.opened import OpenedModel, open_model
+from nexwarp.run.fit_poses import fit_poses
+from nexwarp.run.folder import METRICS_FILE, RENDERS_FOLDER, keep_camera_path, locked_run, read_metrics
+from nexwarp.run.opened import OpenedModel, near_depth, open_model
 from nexwarp.run.render import RenderOrder
-from nexwarp.train.recipe import preset
+from nexwarp.train.recipe import MASK_MODES, preset
+
+if TYPE_CHECKING:
+    from nexwarp.viewer import Viewer
+
+
+@dataclass
+class Process:
+    """Make a scene of a video or of photos: choose sharp frames, then estimate the cameras by structure from motion.
+
+    Blurred and repeated frames of a video are left out; among photos, they are named. `process` and `sfm` are two names
+    of one command.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO|PHOTOS")]
+    """A video (extra `video`), or a folder of photos (JPEG, PNG, TIFF, BMP) with its subfolders."""
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    """Output folder: images/ (undistorted), sparse/0/ (a COLMAP model) and the report sfm.json."""
+    frames: Annotated[int, option("N")] = FRAMES
+    """Number of equal parts of a video, of which each gives its sharpest frame."""
+    settings: tyro.conf.OmitArgPrefixes[SfmOptions] = dataclasses.field(default_factory=SfmOptions)
+    overwrite: Flag_ = False
+    """Replace images/, sparse/ and sfm.json of SCENE if nexwarp wrote all that is in them; other files stay."""
+
+    def __call__(self, console: Console) -> None:
+        """Make the scene."""
+        self.make(console)
+        console.print(f"next: nexwarp train {self.scene}", soft_wrap=True, markup=False, highlight=False)
+
+    def make(self, console: Console) -> None:
+        """Make the scene, and print the report."""
+        with display.stages(console) as observe:
+            report = process(
+                self.source, self.scene, self.frames, self.settings, overwrite=self.overwrite, observe=observe
+            )
+        console.print(display.results_table(report.rows(), str(self.scene)))
+        for line in report.lines():
+            console.print(line, soft_wrap=True, markup=False, highlight=False)
+
+
+def is_video(path: str) -> bool:
+    """Whether a path is the file of a video, by its suffix."""
+    return Path(path).suffix.lower() in FILMS and not Path(path).is_dir()
+
+
+def scene_folder_of(video: Path) -> Path:
+    """Return the folder of the scene that `nexwarp train` makes of a video."""
+    return Path("scenes") / video.stem
+
+
+def scene_of_video(video: Path, console: Console) -> None:
+    """Make the scene of a video, unless that was done before; RunError if its folder holds something else."""
+    if not video.is_file():
+        raise FileNotFoundError(f"{video}: no such file, expected a video")
+    scene = scene_folder_of(video)
+    if (scene / REPORT_FILE).is_file():
+        try:
+            made_of = read_object(scene / REPORT_FILE).get("video")
+        except READ_ERRORS:
+            made_of = None
+        if made_of == video_identity(video):
+            console.print(f"{video}: the scene {scene} was made of it before", soft_wrap=True, highlight=False)
+            return
+    if scene.exists():
+        raise RunError(
+            f"{scene}: expected no folder of that name, or a scene made of {video}; "
+            f"make a scene with nexwarp process {video} SCENE, and train that"
+        )
+    Process(video, scene).make(console)
+
+
+@dataclass
+class Eval:
+    """Evaluate a run on the test views of its scene, or a model on those of --scene."""
+
+    run: Run_
+    """Run folder, or a model's folder or .safetensors file."""
+    scene: Annotated[str | None, option("SCENE", "the folder of the training")] = None
+    """Folder of the scene, if it has moved; required for a model alone."""
+    metrics: Annotated[tuple[str, ...], option("{psnr,ssim,flip,lpips} ...", "psnr ssim")] = ("psnr", "ssim")
+    """Metrics to compute; flip needs the extra `flip`, lpips a file of weights (docs/quality.md)."""
+    refine_poses: Flag_ = False
+    """Fit each test pose to its photo before it is judged, the model fixed; metrics.json says so."""
+    device: Device_ = None
+    """Device to render on."""
+
+    def __call__(self, console: Console) -> None:
+        """Evaluate."""
+        device = pick_device(self.device)
+        check_metrics(self.metrics, device)
+        opened = open_model(self.run)  # before a lock is written to a foreign folder
+        source = opened.source
+        if self.scene is not None:
+            source = dataclasses.replace(source or SceneSource(""), path=self.scene)
+        if source is None:
+            lacks = "expected the photos to compare with, got a model alone; give --scene SCENE"
+            raise MissingError(f"{self.run}: {lacks}")
+        opened.folder.mkdir(exist_ok=True)
+        with locked_run(opened.folder, partial(display.warn, console)):
+            opened = open_model(self.run)  # another process may have changed it
+            model = opened.model.to(device)
+            with display.loading(console) as progress:
+                scene = source.load(progress)
+            if not scene.test:
+                raise SceneError(f"{scene.path}: expected test views, found none")
+            views = scene.test
+            facts = read_metrics(opened.folder)
+            facts.pop("test_poses", None)  # of an earlier evaluation
+            if self.refine_poses:
+                with display.counting(console, "fitting test poses", len(views)) as done:
+                    views, moves = fit_poses(model, views, progress=done)
+                facts["test_poses"] = {**moves}
+            mask_mode = MASK_MODES[0] if opened.config is None else opened.config.mask_mode
+            options = {"mask_mode": mask_mode, "metrics": self.metrics}
+            results = evaluate_run(model, views, opened.folder, console, facts, **options)
+        rows = figures(results, self.metrics)
+        fitted = ", poses fitted to their photos" if self.refine_poses else ""
+        console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views{fitted}"))
+
+
+def figures(results: Mapping[str, Json], metrics: Sequence[str] = ("psnr", "ssim")) -> dict[str, str]:
+    """Return test metrics as rows of a table."""
+    rows = {}
+    for name in metrics:
+        value = results[name]
+        if name == "psnr":
+            text = f"{math.inf if value is None else value:.2f} dB"
+        else:
+            text = "not available" if value is None else f"{value:.4f}"
+        rows[f"test {name.upper()}"] = text
+    return rows
+
+
+def evaluate_run(
+    model: Model,
+    views: Sequence[View],
+    run: Path,
+    console: Console,
+    facts: dict[str, Json],
+    **options: Any,
+) -> dict[str, Json]:
+    """Evaluate a model on test views and write metrics.json with `facts`; return its entries. See `evaluate`."""
+    with display.counting(console, "evaluating", len(views)) as done:
+        results = evaluate(model, views, renders=run / RENDERS_FOLDER, progress=done, **options)
+    entries = facts | cast(dict[str, Json], results)
+    write_json(run / METRICS_FILE, _finite(entries))
+    return entries
+
+
+def _finite(value: Json) -> Json:
+    """Return JSON with null for infinity, which JSON does not have: the PSNR of equal pictures."""
+    if isinstance(value, dict):
+        return {name: _finite(inner) for name, inner in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @dataclass
@@ -106,17 +271,23 @@ class Info:
 
 def _describe_model(opened: OpenedModel) -> dict[str, str]:
     """Summarise a model as rows of a table."""
-    model = opened.model
-    texture = model.texture.config if isinstance(model.texture, NeuralTexture) else None
+    model, exposures = opened.model, opened.model.exposures
+    texture = "not used"
+    if isinstance(model.texture, NeuralTexture) and model.options.max_hits:
+        config = model.texture.config
+        cells = f"{config['min_resolution']:.3g} to {config['max_resolution']:.3g} cells per unit"
+        texture = f"{config['levels']} levels of {config['table_size']:,}, {cells}"
+    light = "one for all photos"
+    if exposures is not None:
+        gains = exposures.log_gains.exp()
+        edge = exposures.falloff[:2].sum().exp()
+        light = f"{gains.min():.2f} to {gains.max():.2f} times the photos' mean; light at the edge: {edge:.0%}"
     budget = "" if opened.config is None else f" (budget {opened.config.max_surfels:,})"
     return {
         "surfels": f"{len(model.surfels):,}{budget}",
         "K": str(model.options.max_hits),
-        "texture": "not used"
-        if texture is None or model.options.max_hits == 0
-        else f"{texture['levels']} levels of {texture['table_size']:,}, "
-        f"{texture['min_resolution']:.3g} to {texture['max_resolution']:.3g} cells per unit",
-        "exposures": describe_exposures(model),
+        "texture": texture,
+        "exposures": light,
         "model file": f"{opened.file.stat().st_size / 1e6:.1f} MB",
     }
 
@@ -145,7 +316,47 @@ class Warmup:
             warmup.rehearse(config, device, done)
         compiled = len(warmup.cached_binaries() - before)
         console.print(
-            f"kernels ready on {device_name(device)}, preset {config.preset}: {compiled} compiled, "
+            f"kernels ready on {display.device_name(device)}, preset {config.preset}: {compiled} compiled, "
             f"{time.perf_counter() - start:.1f} s",
             soft_wrap=True,
         )
+
+
+@dataclass
+class ViewCommand:
+    """Show a run or a model in the browser, with all buffers and an editor of camera paths (extra `viewer`)."""
+
+    run: Run_
+    """Run folder, or a model's folder or .safetensors file."""
+    host: Host_ = "127.0.0.1"
+    """Address to listen on; 0.0.0.0 allows other machines, with the token of the URL that is printed."""
+    port: Port_ = 8080
+    """Port to listen on; 0 picks a free one."""
+    device: Device_ = None
+    """Device to render on."""
+
+    def __call__(self, console: Console) -> None:
+        """Serve the viewer until Ctrl-C."""
+        from nexwarp.viewer import Viewer, ViewerOptions
+
+        opened = open_model(self.run)
+        model = opened.model.to(pick_device(self.device))
+        with Viewer(
+            lambda: model,
+            opened.cameras,
+            ViewerOptions(near_depth(model), opened.title, self.host, self.port),
+            save_path=partial(keep_camera_path, opened.folder, opened=self.run, origin=model.origin),
+        ) as viewer:
+            show_until_interrupted(viewer, console)
+
+
+def print_url(viewer: "Viewer", console: Console, more: str = "") -> None:
+    """Print the viewer's address on one line, exactly: it may hold a token, or brackets."""
+    console.print(f"viewer: {viewer.url}{more}", soft_wrap=True, markup=False)
+
+
+def show_until_interrupted(viewer: "Viewer", console: Console) -> None:
+    """Serve the viewer of a finished model until Ctrl-C."""
+    print_url(viewer, console, " (Ctrl-C ends it)")
+    with suppress(KeyboardInterrupt):
+        viewer.show()

@@ -20,23 +20,11 @@ from rich.progress import (
 from rich.table import Table
 
 from nexwarp.io.files import printable
-from nexwarp.model.model import Model
 from nexwarp.run.log import peak_memory
 from nexwarp.train.report import StepReport
 
 REFRESH_SECONDS = 0.5
 LOG_LINES = 20
-
-
-def describe_exposures(model: Model) -> str:
-    """Summarise the exposures of a model's training photos."""
-    exposures = model.exposures
-    if exposures is None:
-        return "one for all photos"
-    gains = exposures.log_gains.exp()
-    edge = exposures.falloff[:2].sum().exp()
-    text = f"{gains.min():.2f} to {gains.max():.2f} times the photos' mean"
-    return f"{text}; light at the edge: {edge:.0%}"
 
 
 def device_name(device: torch.device) -> str:
@@ -61,55 +49,41 @@ def plain_warnings(console: Console) -> Iterator[None]:
         yield
 
 
-class TrainingDisplay:
-    """Observer of a training that shows iteration, it/s, time left, loss, training PSNR, surfels and memory."""
+@contextmanager
+def training(
+    console: Console, total: int, done: int, device: torch.device, name: str
+) -> Iterator[Callable[[StepReport], None]]:
+    """Show iteration, it/s, time left, loss, training PSNR, surfels and memory of `total` iterations.
 
-    def __init__(self, console: Console, total: int, done: int, device: torch.device, name: str = "training") -> None:
-        """Prepare the display of `total` iterations, of which `done` were done before."""
-        self.console = console
-        self.total = total
-        self.done = done
-        self.device = device
-        self.start = self.shown = time.perf_counter()
-        self.progress = Progress(
-            TextColumn(name),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[text]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=console,
-            disable=not console.is_terminal,
-        )
-        self.task = self.progress.add_task(name, total=total, completed=done, text="")
+    `done` of them were done before. Yield a function to call after each step: its numbers are fetched from the device
+    only when they are shown.
+    """
+    start = shown = time.perf_counter()
+    text = TextColumn("{task.fields[text]}")
+    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), text, TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task(name, total=total, completed=done, text="")
 
-    def __enter__(self) -> "TrainingDisplay":
-        self.progress.start()
-        return self
+        def show(step: StepReport) -> None:
+            nonlocal shown
+            now = time.perf_counter()
+            if console.is_terminal:
+                due = now - shown >= REFRESH_SECONDS
+            else:
+                due = step.passed(max(total // LOG_LINES, 1))
+            if not due and step.iteration < total:
+                return
+            shown = now
+            rate = (step.iteration - done) / max(now - start, 1e-9)
+            text = f"{rate:.1f} it/s  loss {step.loss():.4f}  train {step.psnr():.2f} dB  {step.surfels:,} surfels"
+            if (used := peak_memory(device)) is not None:
+                text += f"  {used / 2**30:.1f} GiB{' GPU' if device.type == 'cuda' else ''}"
+            progress.update(task, completed=step.iteration, text=text)
+            if not console.is_terminal:
+                left = f"{(total - step.iteration) / max(rate, 1e-9):.0f} s left"
+                console.print(f"iteration {step.iteration:,}/{total:,}  {text}  {left}", soft_wrap=True)
 
-    def __exit__(self, *_: object) -> None:
-        self.progress.stop()
-
-    def __call__(self, step: StepReport) -> None:
-        """Show a step; its numbers are fetched from the device only when they are shown."""
-        now = time.perf_counter()
-        if self.console.is_terminal:
-            due = now - self.shown >= REFRESH_SECONDS
-        else:
-            due = step.passed(max(self.total // LOG_LINES, 1))
-        if not due and step.iteration < self.total:
-            return
-        self.shown = now
-        rate = (step.iteration - self.done) / max(now - self.start, 1e-9)
-        text = f"{rate:.1f} it/s  loss {step.loss():.4f}  train {step.psnr():.2f} dB  {step.surfels:,} surfels"
-        if (used := peak_memory(self.device)) is not None:
-            text += f"  {used / 2**30:.1f} GiB{' GPU' if self.device.type == 'cuda' else ''}"
-        self.progress.update(self.task, completed=step.iteration, text=text)
-        if not self.console.is_terminal:
-            seconds_left = (self.total - step.iteration) / max(rate, 1e-9)
-            self.console.print(
-                f"iteration {step.iteration:,}/{self.total:,}  {text}  {seconds_left:.0f} s left", soft_wrap=True
-            )
+        yield show
 
 
 def _bars(console: Console, *last: ProgressColumn) -> Progress:

@@ -15,12 +15,9 @@ import tyro
 from rich.console import Console
 
 from nexwarp.cli import __version__, display
-from nexwarp.cli.commands import Export, Info, Render, Warmup
-from nexwarp.cli.eval import Eval
-from nexwarp.cli.process import Process
+from nexwarp.cli.commands import Eval, Export, Info, Process, Render, ViewCommand, Warmup
 from nexwarp.cli.signals import deferred_stop, stopped_by_signals
 from nexwarp.cli.train import Train
-from nexwarp.cli.view import ViewCommand
 from nexwarp.errors import NexwarpError, RankError
 from nexwarp.io.files import printable
 from nexwarp.machine import needed_memory

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +14,7 @@ from rich.console import Console
 
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.cli import display
-from nexwarp.cli.eval import evaluate_run, figures
+from nexwarp.cli.commands import evaluate_run, figures
 from nexwarp.cli.signals import Stopped, deferred_stop
 from nexwarp.errors import DivergedError, OutOfMemoryError, RunError, StorageError
 from nexwarp.io.json_files import Json, write_json
@@ -48,6 +49,7 @@ if TYPE_CHECKING:
 CHECKPOINTS_A_RUN = 10
 
 
+@dataclass
 class Session(StageStore):
     """Trains stages in a run folder: each stage is trained in a folder of its own.
 
@@ -55,28 +57,16 @@ class Session(StageStore):
     written last, says how long the training took.
     """
 
-    def __init__(
-        self,
-        run: Path,
-        record: RunRecord,
-        console: Console,
-        ranks: Ranks,
-        *,
-        resume: bool = False,
-        tensorboard: bool = False,
-        every: int | None = None,
-    ) -> None:
-        """Note what to do; the student also logs to TensorBoard; `every` None saves ten checkpoints a stage."""
-        self.run = run
-        self.record = record
-        self.console = console
-        self.ranks = ranks
-        self.resume = resume
-        self.tensorboard = tensorboard
-        self.every = every
-        self.viewer: Viewer | None = None
-        self.seconds = 0.0
-        self.begun = False
+    run: Path
+    record: RunRecord
+    console: Console
+    ranks: Ranks
+    resume: bool = False
+    tensorboard: bool = False  # of the student
+    every: int | None = None  # iterations between checkpoints; None saves ten a stage
+    viewer: "Viewer | None" = None
+    seconds: float = 0.0  # that complete teachers took
+    begun: bool = False
 
     def complete(self, stage: Stage) -> Model | None:
         """Return the model of a teacher that is complete; None where it is not."""
@@ -117,17 +107,17 @@ class Session(StageStore):
             create_run(folder, RunRecord(self.record.source, stage.config, self.ranks.device.type))
         total = stage.config.iterations
         every = self.every or max(total // CHECKPOINTS_A_RUN, 1)
-        bar = display.TrainingDisplay(self.console, total, trainer.iteration, trainer.device, stage.name)
+        bar = display.training(self.console, total, trainer.iteration, trainer.device, stage.name)
         log = TrainingLog(folder, trainer, tensorboard=self.tensorboard and not stage.teacher)
         with ExitStack() as stack:
             if self.ranks.first:
-                stack.enter_context(bar)
+                show = stack.enter_context(bar)
                 stack.enter_context(log)
             stop_signal = stack.enter_context(deferred_stop())
 
             def observe(step: StepReport) -> None:
                 if self.ranks.first:
-                    bar(step)
+                    show(step)
                     with _model_kept(folder, trainer):
                         log(step)
                 if self.viewer is not None:
@@ -201,32 +191,19 @@ class Session(StageStore):
         return DivergedError(f"{error}; {outcome}")
 
     def _write(self, stage: Stage, trainer: Trainer) -> Model:
-        """Finish and write the model of a stage, its cameras and figures."""
+        """Finish and write the model of a stage, its cameras and figures; a student's have the time of its teachers."""
         folder = self._folder(stage)
-        unrefined = trainer.scene.cameras
         with display.stages(self.console) as observe:
             finished = trainer.finish(observe)
         file = save_model(folder, finished)
         model = shared_model(file, self.ranks)
-        cameras = unrefined
+        cameras = unrefined = trainer.scene.cameras
         if trainer.poses is not None:
             refined = trainer.views.refined_cameras(trainer.poses)
             cameras = unrefined | {TRAIN: dict(zip(unrefined[TRAIN], refined, strict=True))}
         save_cameras(folder / CAMERAS_FILE, cameras, unrefined)
-        facts = self._facts(stage, trainer)
-        facts |= {"surfels": len(model.surfels), "megabytes": file.stat().st_size / 1e6}
-        if stage.teacher:
-            write_json(folder / METRICS_FILE, facts)
-        else:
-            self._evaluate(trainer, model, facts)
-        return model
-
-    def _facts(self, stage: Stage, trainer: Trainer) -> dict[str, Json]:
-        """Return what metrics.json says of a training; for a student, with the time of the run's teachers."""
-        iterations, seconds = trainer.iteration, trainer.seconds
-        if not stage.teacher:
-            iterations += stage.before
-            seconds += self.seconds
+        iterations = trainer.iteration + (0 if stage.teacher else stage.before)
+        seconds = trainer.seconds + (0 if stage.teacher else self.seconds)
         facts: dict[str, Json] = {
             "preset": stage.config.preset,
             "iterations": iterations,
@@ -236,17 +213,20 @@ class Session(StageStore):
         }
         if trainer.targets.teachers:
             facts["teachers"] = len(trainer.targets.teachers)
-        return facts
+        facts |= {"surfels": len(model.surfels), "megabytes": file.stat().st_size / 1e6}
+        if stage.teacher:
+            write_json(folder / METRICS_FILE, facts)
+        else:
+            self._evaluate(trainer, model, facts)
+        return model
 
     def _evaluate(self, trainer: Trainer, model: Model, facts: dict[str, Json]) -> None:
         """Evaluate the run's model on the test views, if there are any, and print the figures."""
         views = trainer.scene.test
         rows = {}
         if views:
-            mask_mode = trainer.config.mask_mode
-            rows = figures(
-                evaluate_run(model, views, self.run, self.console, facts, mask_mode=mask_mode, ranks=self.ranks)
-            )
+            options = {"mask_mode": trainer.config.mask_mode, "ranks": self.ranks}
+            rows = figures(evaluate_run(model, views, self.run, self.console, facts, **options))
         rows |= {
             "surfels": f"{len(model.surfels):,}",
             "model file": f"{facts['megabytes']:.1f} MB",

@@ -11,12 +11,10 @@ import tyro
 from rich.console import Console
 
 from nexwarp.cli import display
-from nexwarp.cli.device import joined_ranks
+from nexwarp.cli.commands import is_video, print_url, scene_folder_of, scene_of_video, show_until_interrupted
 from nexwarp.cli.display import device_name
-from nexwarp.cli.options import Device_, Flag_, Host_, Port_, Preset_, check_max_hits, option
-from nexwarp.cli.process import is_video, scene_folder_of, scene_of_video
+from nexwarp.cli.options import Device_, Flag_, Host_, Port_, Preset_, check_max_hits, joined_ranks, option
 from nexwarp.cli.session import Session
-from nexwarp.cli.view import print_url, show_until_interrupted
 from nexwarp.data import Scene
 from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import SettingError
@@ -108,9 +106,8 @@ class Train:
 
     def starts(self) -> int:
         """Return how many processes this command is to start; 0 if it trains in this one."""
-        if is_rank() or self.gpus in (None, 1):
+        if is_rank() or self.gpus is None or self.gpus == 1:
             return 0
-        assert self.gpus is not None
         check_count(self.gpus, self.device)
         return self.gpus
 
@@ -121,14 +118,23 @@ class Train:
         with ExitStack() as claim:
             record, resume = self._plan(run, ranks, claim, console)
             teachers = [load(path) for path in record.teachers]  # a wrong path is told before photos are read
-            start = _start(record.init, resume)
+            start: Start = {}
+            # Of a run to resume, the checkpoint has the surfels, and only a texture counts.
+            if record.init is not None and not (resume and record.init.suffix == PLY):
+                is_ply = record.init.suffix == PLY
+                start = {"surfels": Surfels.load(record.init)} if is_ply else {"init": load(record.init)}
             scene = _load_scene(record, ranks, console)
             try:
                 check_start(scene, record.config, start)
             except ValueError as error:
                 raise SettingError(f"--init: {error}") from None
             if not resume:
-                config = self._with_background(record.config, scene)
+                config = record.config
+                if scene.background is not None:
+                    if "background" in parse_settings(self.settings):
+                        expected = "expected --background instead, which also applies to the photos"
+                        raise SettingError(f"--set: background: {expected}")
+                    config = dataclasses.replace(config, background=scene.background)
                 own = NO_TEACHERS if teachers else plan_teachers(config, len(scene.train))
                 record = dataclasses.replace(record, config=config, own=own)
             session = Session(
@@ -145,8 +151,9 @@ class Train:
             if self.resume and not resume:
                 console.print(f"{run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
             with self._viewer(runner, scene, record, run, console) if ranks.first else nullcontext() as viewer:
-                if not resume and ranks.first:
-                    _tell_foreign(console, run, create_run(run, record))
+                if not resume and ranks.first and (foreign := create_run(run, record)):
+                    kept = f"{foreign[0]} and {len(foreign) - 1} more" if len(foreign) > 1 else foreign[0]
+                    display.warn(console, f"{run}: not deleted, as nexwarp did not write it: {kept}")
                 session.viewer = viewer
                 runner.train()
                 model = runner.finish()
@@ -180,26 +187,24 @@ class Train:
         if resume:
             return self._resumed(read_run(run))
         config = self._config()
-        for path in self.teachers:
-            if path.resolve().is_relative_to(run.resolve()):
-                raise SettingError(f"--teacher: expected another run than {run}, which is written, got {path}")
-        if self.init is not None and self.init.resolve().is_relative_to(run.resolve()):
-            raise SettingError(f"--init: expected another run than {run}, which is written, got {self.init}")
+        for flag, paths in (("--teacher", self.teachers), ("--init", (self.init,))):
+            for path in paths:
+                if path is not None and path.resolve().is_relative_to(run.resolve()):
+                    raise SettingError(f"{flag}: expected another run than {run}, which is written, got {path}")
         if self.teachers and config.refine_poses:
             raise SettingError("--teacher: expected poses that stay as given, got --refine-poses")
         return RunRecord(self.scene, config, ranks.device.type, self.teachers, init=self.init)
 
     def _config(self) -> Config:
         """Return the settings of a new run."""
-        flags = self._flags()
-        settings = self._settings(flags)
+        flags, settings = self._settings()
         base = preset(self.preset)
         if self.scene.path == DEMO:
             base = with_settings(base, DEMO_SETTINGS)
         return _with_set(with_settings(base, flags), settings)
 
-    def _flags(self) -> dict[str, Json]:
-        """Return the settings that are given as options of their own."""
+    def _settings(self) -> tuple[dict[str, Json], dict[str, Json]]:
+        """Return the settings that are given as options of their own, and those of --set, which must be others."""
         check_max_hits(self.max_hits)
         flags: dict[str, Json] = {
             "iterations": self.iterations,
@@ -209,10 +214,7 @@ class Train:
             "deterministic": self.deterministic or None,
             "refine_poses": self.refine_poses or None,
         }
-        return {name: value for name, value in flags.items() if value is not None}
-
-    def _settings(self, flags: dict[str, Json]) -> dict[str, Json]:
-        """Return the settings of --set; those that are also given as an option of their own are refused."""
+        flags = {name: value for name, value in flags.items() if value is not None}
         try:
             settings = parse_settings(self.settings)
         except ValueError as error:
@@ -220,12 +222,11 @@ class Train:
         for name in settings:
             if name == "preset" or name in flags:
                 raise SettingError(f"--set: {name}: expected {_flag(name)} instead of --set")
-        return settings
+        return flags, settings
 
     def _resumed(self, old: RunRecord) -> RunRecord:
         """Return the run to resume. Its scene may have moved, and --iterations may be larger; the rest must agree."""
-        flags = self._flags()
-        settings = self._settings(flags)
+        flags, settings = self._settings()
         scene = self.scene.absolute()
         for field in dataclasses.fields(SceneSource):
             value = getattr(scene, field.name)
@@ -261,14 +262,6 @@ class Train:
             from nexwarp.viewer import check_server
 
             check_server(self.host, self.port)
-
-    def _with_background(self, config: Config, scene: Scene) -> Config:
-        """Return a config with the background of the scene's photos."""
-        if scene.background is None:
-            return config
-        if "background" in parse_settings(self.settings):
-            raise SettingError("--set: background: expected --background instead, which also applies to the photos")
-        return dataclasses.replace(config, background=scene.background)
 
     def _scene_of_video(self, ranks: Ranks, console: Console) -> str:
         """Return the scene of a video, which rank 0 makes unless the run folder would be refused later."""
@@ -322,13 +315,6 @@ def _with_set(config: Config, settings: dict[str, Json]) -> Config:
         raise SettingError(f"--set: {error}") from None
 
 
-def _start(path: Path | None, resume: bool) -> Start:
-    """Return what a run starts from; of one to resume, the checkpoint has the surfels, and only a texture counts."""
-    if path is None or (resume and path.suffix == PLY):
-        return {}
-    return {"surfels": Surfels.load(path)} if path.suffix == PLY else {"init": load(path)}
-
-
 def _load_scene(record: RunRecord, ranks: Ranks, console: Console) -> Scene:
     """Load the scene, and say what it holds."""
     count = f", {ranks.size} ranks" if ranks.size > 1 else ""
@@ -352,10 +338,3 @@ def _tell_extension(run: Path, config: Config, console: Console) -> None:
             "density control and all other schedules are those of a run of that length",
             soft_wrap=True,
         )
-
-
-def _tell_foreign(console: Console, run: Path, names: list[str]) -> None:
-    """Say which files an overwritten run folder keeps."""
-    if names:
-        kept = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
-        display.warn(console, f"{run}: not deleted, as nexwarp did not write it: {kept}")

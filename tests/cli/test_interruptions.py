@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from nexwarp.cli import main as cli
-from nexwarp.cli.display import TrainingDisplay
+from nexwarp.run.log import TrainingLog
 from nexwarp.train.adam import FusedAdam
 from nexwarp.train.densify import DensityControl
 from nexwarp.train.trainer import Trainer
@@ -37,8 +37,8 @@ def interrupt_after(
 @pytest.mark.parametrize(
     ("owner", "method", "calls"),
     [
-        (TrainingDisplay, "__call__", 7),  # between two steps
-        (TrainingDisplay, "__call__", 1),  # before there is any checkpoint
+        (TrainingLog, "__call__", 7),  # between two steps
+        (TrainingLog, "__call__", 1),  # before there is any checkpoint
         (DensityControl, "accumulate", 5),  # after a backward pass, before the optimizer steps
         (FusedAdam, "step", 8),
     ],

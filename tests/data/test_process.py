@@ -13,7 +13,7 @@ import torch
 from scipy.ndimage import gaussian_filter, shift
 
 from nexwarp.cli import main as cli
-from nexwarp.cli.process import is_video
+from nexwarp.cli.commands import is_video
 from nexwarp.data import load_scene
 from nexwarp.data.sfm.frames import motion, sharpness, take_frames
 from nexwarp.data.sfm.photos import judged, read_photos

@@ -13,7 +13,7 @@ import nexwarp as nw
 from nexwarp import errors
 from nexwarp.cli import main as cli
 from nexwarp.cli.commands import Info
-from nexwarp.cli.device import pick_device
+from nexwarp.cli.options import pick_device
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import DivergedError, FormatError, MissingError, NexwarpError, RunError, SettingError, StorageError
 from nexwarp.io.files import write_atomically
