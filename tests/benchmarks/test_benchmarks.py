@@ -1,27 +1,33 @@
-"""The benchmarks measure what they say: the timer, the scenes, the command line, the torch comparison."""
+"""The benchmarks measure what they say: timer, scenes, commands, gsplat, the README's picture."""
 
 import json
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+import nexwarp as nw
 from benchmarks import __main__ as command
-from benchmarks import bench_frame, bench_peers
+from benchmarks import before_after, bench_frame, bench_peers
+from benchmarks.before_after import Values, compare
 from benchmarks.gpu_time import busy
+from benchmarks.picture import GAP, draw_row
 from benchmarks.scenes import SurfelScene, cloud, fox, garden, geometry, texture, workload
 from benchmarks.suite import Options, table
-from benchmarks.timing import Measurement, Repeats, measure
-from nexwarp import NeuralTexture
+from benchmarks.timing import ROOT, Measurement, Repeats, measure
 from nexwarp.cameras.cameras_file import save_cameras
+from nexwarp.io.pictures import CAPTION_HEIGHT, to_uint8
 from nexwarp.model.detail_limits import NEVER
-from nexwarp.model.model import Model
-from nexwarp.model.options import RenderOptions
 from nexwarp.ops import Pinhole
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 
 CPU = torch.device("cpu")
+
+
+QUICK = ["--quick", "--device", "cpu", "--only"]
 
 
 def small_scene() -> SurfelScene:
@@ -52,25 +58,13 @@ def test_table_compares_gpu_and_cpu() -> None:
     assert "times as fast" not in table(results[:1])
 
 
-def points_file(folder: Path) -> None:
-    """A garden_points.npz of few points."""
-    import numpy as np
-
-    generator = np.random.default_rng(0)
-    K = np.array([[480.0, 0, 324], [0, 480, 210], [0, 0, 1]], dtype=np.float32)
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[2, 3] = 3.0
-    np.savez(
-        folder / "garden_points.npz",
-        means3d=generator.normal(size=(50, 3)).astype(np.float32),
-        colors=generator.integers(0, 256, (50, 3), dtype=np.uint8),
-        viewmats=viewmat[None],
-        Ks=K[None],
-    )
-
-
 def test_scenes_are_seeded(tmp_path: Path) -> None:
-    points_file(tmp_path)
+    generator = np.random.default_rng(0)
+    points = {"means3d": generator.normal(size=(50, 3)).astype(np.float32)}
+    points |= {"colors": generator.integers(0, 256, (50, 3), dtype=np.uint8)}
+    K, viewmat = np.float32([[480.0, 0, 324], [0, 480, 210], [0, 0, 1]]), np.eye(4, dtype=np.float32)
+    viewmat[2, 3] = 3.0
+    np.savez(tmp_path / "garden_points.npz", viewmats=viewmat[None], Ks=K[None], **points)
     made = []
     for seed in (1, 2):
         torch.manual_seed(seed)  # scenes must not depend on it
@@ -89,15 +83,10 @@ def test_scenes_are_seeded(tmp_path: Path) -> None:
 
 def test_command_writes_well_formed_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "figures.json"
-    assert command.main(["--quick", "--device", "cpu", "--only", "collect", "--out", str(out)]) == 0
+    assert command.main([*QUICK, "collect", "--out", str(out)]) == 0
     lines = [json.loads(line) for line in out.read_text().splitlines()]
-    names = [line["name"] for line in lines]
-    assert names == [
-        "collect, forward",
-        "collect, backward",
-        "collection stage, forward",
-        "collection stage, forward + backward",
-    ]
+    names = ["collect, forward", "collect, backward", *(f"collection stage, forward{x}" for x in ("", " + backward"))]
+    assert [line["name"] for line in lines] == names
     for line in lines:
         assert line.keys() == Measurement.__dataclass_fields__.keys()
         assert line["device"] == "cpu" and line["unit"] == "ms" and line["device_name"]
@@ -107,7 +96,7 @@ def test_command_writes_well_formed_json(tmp_path: Path, capsys: pytest.CaptureF
     assert all(name in shown for name in names)
 
 
-OPTIONS = RenderOptions(max_hits=1, background=(0.0, 1.0, 0.0), sh_degree=2, clamp_texture=True)
+OPTIONS = nw.RenderOptions(max_hits=1, background=(0.0, 1.0, 0.0), sh_degree=2, clamp_texture=True)
 
 
 @pytest.fixture
@@ -116,23 +105,20 @@ def run_folder(tmp_path: Path) -> Path:
     folder = tmp_path / "run"
     folder.mkdir()
     scene = small_scene()
-    field = NeuralTexture(levels=4, table_size=2**8, width=16)
-    Model(scene.surfels, field, options=OPTIONS).save(folder)
+    field = nw.NeuralTexture(levels=4, table_size=2**8, width=16)
+    nw.Model(scene.surfels, field, options=OPTIONS).save(folder)
     cameras = {str(i): camera for i, camera in enumerate(scene.cameras)}
     save_cameras(folder / "cameras.json", {"train": cameras, "test": {}})
     return folder
 
 
-def test_trained_scene_is_that_of_the_run(run_folder: Path) -> None:
+def test_trained_scene_is_that_of_the_run_and_takes_part_when_it_is_named(run_folder: Path) -> None:
     scene, made = fox(run_folder), small_scene()
     assert torch.equal(scene.surfels.means, made.surfels.means)
     assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(scene.cameras, made.cameras, strict=True))
     assert texture(scene) is scene.model.texture and texture(scene).config["table_size"] == 2**8
     assert scene.model.options == OPTIONS
     assert "fox" in scene.name and "300 at 43x30" in scene.name
-
-
-def test_trained_scene_takes_part_only_when_it_is_named(run_folder: Path) -> None:
     without, with_model = (workload(Options(CPU, quick=True, model=model)) for model in (None, run_folder))
     assert [scene.name for scene in with_model[:-1]] == [scene.name for scene in without]
     assert "fox" in with_model[-1].name and not any("fox" in scene.name for scene in without)
@@ -149,7 +135,7 @@ def test_frames_of_an_untrained_scene_have_what_a_finished_model_has() -> None:
 def test_command_names_the_trained_scene_or_says_that_it_is_absent(
     run_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    quick = ["--quick", "--device", "cpu", "--only", "tiles"]
+    quick = [*QUICK, "tiles"]
     assert command.main(quick) == 0
     assert "the trained fox was left out" in capsys.readouterr().out
     assert command.main([*quick, "--model", str(run_folder)]) == 0
@@ -166,7 +152,7 @@ def test_a_failing_stage_leaves_the_others(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setitem(command.STAGES, "tiles", fail)
     out = tmp_path / "figures.json"
-    assert command.main(["--quick", "--device", "cpu", "--only", "tiles,project", "--out", str(out)]) == 1
+    assert command.main([*QUICK, "tiles,project", "--out", str(out)]) == 1
     assert "project, forward" in out.read_text()
 
 
@@ -187,15 +173,8 @@ def test_peer_gets_the_same_scene() -> None:
     assert isinstance(g.pinhole, Pinhole)
     call = bench_peers.gsplat_call(g, Peer)
     assert len(call.forward()) == 2
-    assert seen == {
-        "means": (300, 3),
-        "quats": (300, 4),
-        "scales": (300, 3),
-        "opacities": (300,),
-        "colors": (1, 300, 3),
-        "viewmats": (1, 4, 4),
-        "Ks": (1, 3, 3),
-    }
+    expected = {"means": (300, 3), "quats": (300, 4), "scales": (300, 3), "opacities": (300,), "colors": (1, 300, 3)}
+    assert seen == {**expected, "viewmats": (1, 4, 4), "Ks": (1, 3, 3)}
     assert all(x.is_leaf and x.requires_grad for x in call.leaves)
 
 
@@ -215,3 +194,51 @@ def test_entries_walked_by_our_side_end_at_each_pixel_s_last_hit() -> None:
     starts = tiles.tile_offsets[(y // 16) * tiles.columns + x // 16]
     assert walked == pytest.approx((hits.stops - starts).double().mean().item())
     assert 0 < walked < listed
+
+
+def test_checkouts_are_measured_in_turns(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    turns: list[str] = []
+
+    def measure(root: Path, options: list[str]) -> Values:
+        assert options == ["--only", "frame", "--device", "cpu"]
+        turns.append(root.name)
+        return {("frame", "garden", "ms"): 10.0 * len(turns), ("new", "garden", "ms"): 1.0}
+
+    for name in "ab":
+        (tmp_path / name / "benchmarks").mkdir(parents=True)
+    monkeypatch.setattr(before_after, "measure", measure)
+    out = tmp_path / "report.json"
+    command = [str(tmp_path / name) for name in "ab"]
+    before_after.main([*command, "--only", "frame", "--device", "cpu", "--repeats", "2", "--out", str(out)])
+    assert turns == ["a", "b"] * 2
+    frame = json.loads(out.read_text())[0]
+    assert (frame["before"], frame["after"]) == ([10.0, 30.0], [20.0, 40.0]) and frame["ratio"] == pytest.approx(1.5)
+
+
+def test_figures_of_one_side_are_left_out() -> None:
+    key = ("growth", "garden", "MiB")
+    rows = compare([{key: 0.0, ("old", "", "ms"): 1.0}], [{key: 1.0}])
+    assert [(row["name"], row["ratio"]) for row in rows] == [("growth", None)]
+    assert "growth" in before_after.table(rows)
+
+
+def test_a_checkout_measures_itself() -> None:
+    values = before_after.measure(ROOT, ["--quick", "--device", "cpu", "--only", "tiles"])
+    assert values["tiles", "cloud 500 at 64x48", "ms"] > 0
+
+
+def test_columns_are_the_photo_and_what_its_camera_sees() -> None:
+    scene = random_scene(8)
+    camera, model = make_camera(scene).to(torch.float32), nw.Model(make_surfels(scene), make_texture())
+    photo = torch.randint(0, 256, (camera.height, camera.width, 3), dtype=torch.uint8)
+    row = draw_row(model, nw.View(camera, photo, None, "photo.png"))
+    assert row.shape == (camera.height + CAPTION_HEIGHT, 4 * camera.width + 3 * GAP, 3)
+    columns = [row[CAPTION_HEIGHT:, i * (camera.width + GAP) :][:, : camera.width] for i in range(4)]
+    with torch.no_grad():
+        rendering, plain = model.render(camera), model.render(camera, max_hits=0)
+    assert columns[0].equal(photo)
+    assert columns[1].equal(to_uint8(rendering.image)) and columns[2].equal(to_uint8(plain.image))
+    empty, heaviest = (columns[3] == 255).all(-1), rendering.ids[..., 0]
+    assert empty.equal(heaviest < 0) and 0.0 < empty.float().mean() < 1.0
+    for surfel in heaviest.unique()[1:]:
+        assert len(columns[3][heaviest == surfel].unique(dim=0)) == 1

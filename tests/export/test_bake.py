@@ -43,21 +43,17 @@ def baked(model, cameras) -> Baked:
     return bake(model, list(cameras.values()), steps=40)
 
 
-def test_no_texel_has_two_owners(baked):
+def test_texels_have_one_owner_each_and_lie_where_sampling_looks_for_them(baked):
     layout = baked.layout
     owners = torch.zeros(layout.height, layout.width, dtype=torch.long)
-    ((places, ids, _),) = layout.centres()
+    ((places, ids, local),) = layout.centres()
     owners.index_put_((places[:, 1], places[:, 0]), torch.ones(len(ids), dtype=torch.long), accumulate=True)
     assert owners.max() == 1 and owners[0].sum() == 0, "the first row is that of surfels without a texture"
     assert owners.sum() == len(ids) > 0
-
-
-def test_texels_lie_where_sampling_looks_for_them(baked):
-    ((places, ids, local),) = baked.layout.centres()
-    assert_close(baked.layout.texels(ids, local), places.float(), kind="value", name="places")
+    assert_close(layout.texels(ids, local), places.float(), kind="value", name="places")
     # Beyond its box a surfel has the colours of the box's side.
-    beyond = baked.layout.texels(ids, local + 100.0)
-    assert_close(beyond, (baked.layout.rects[ids, :2] + baked.layout.rects[ids, 2:] - 1).float(), kind="value", name="")
+    corners = (layout.rects[ids, :2] + layout.rects[ids, 2:] - 1).float()
+    assert_close(layout.texels(ids, local + 100.0), corners, kind="value", name="beyond")
 
 
 def test_an_atlas_that_is_too_small_has_larger_texels(model, cameras):
@@ -78,15 +74,10 @@ def test_the_first_atlas_has_the_colors_of_the_texture(residual, cameras):
     assert psnr(image, expected) > max(45, psnr(plain, expected) + 10)
 
 
-def test_images_are_those_of_the_definition(baked, cameras):
+def test_images_are_those_of_the_definition_and_the_fit_approaches_the_model(baked, model, cameras):
     for camera in cameras.values():
-        image = baked.render(camera).double()
         # Hits beyond the eighth, and those below a thousandth, have their plain colours.
-        assert psnr(image, composited(copy.deepcopy(baked), camera)) > 50
-
-
-def test_the_fit_approaches_the_model(baked, model, cameras):
-    for camera in cameras.values():
+        assert psnr(baked.render(camera), composited(copy.deepcopy(baked), camera)) > 50
         expected = model.render(camera).image.detach()
         first = evaluate(model, baked.seen, baked.layout).render(camera)
         plain = model.bare(max_hits=0).render(camera).image.detach()
@@ -100,8 +91,8 @@ def test_codes_are_near_the_values(baked):
     inside = baked.atlas.clamp(-scale, scale)
     assert float((decode_atlas(codes, scale) - inside).abs().max()) <= 0.51 * scale / 127
     values = baked.surfels.shN.detach().numpy()
-    codes_, ranges = encode_harmonics(baked.surfels)
-    error = np.abs(decode_harmonics(codes_, ranges) - values)
+    codes, ranges = encode_harmonics(baked.surfels)
+    error = np.abs(decode_harmonics(codes, ranges) - values)
     assert (error <= np.sqrt(np.abs(values) * ranges[0]) / 127 + ranges[0] / 127**2).all()
 
 

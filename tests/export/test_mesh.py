@@ -36,32 +36,27 @@ def sphere_depths(camera: nw.Camera) -> torch.Tensor:
     return torch.where(square > 0, (b - square.clamp_min(0).sqrt()) / a, 0.0).float()
 
 
+def fused(views: list[tuple[nw.Camera, torch.Tensor]]) -> Mesh:
+    """The surface in depths of cameras, in dark red."""
+    field = DistanceField(VOXEL, 4 * VOXEL, views[0][1].device)
+    for camera, depths in views:
+        field.reserve(camera, depths, 10_000)
+    field.allocate()
+    for camera, depths in views:
+        field.fuse(camera, depths, depths.new_tensor([0.5, 0.0, 0.0]).repeat(128, 128, 1))
+    return _without_crumbs(_surface(field, lambda *_: None))
+
+
 @pytest.fixture
 def sphere(device: torch.device) -> Mesh:
-    field = DistanceField(VOXEL, 4 * VOXEL, device)
-    cameras = cameras_around(device)
-    for camera in cameras:
-        field.reserve(camera, sphere_depths(camera), 10_000)
-    field.allocate()
-    for camera in cameras:
-        colors = torch.zeros(128, 128, 3, device=device)
-        colors[..., 0] = 0.5
-        field.fuse(camera, sphere_depths(camera), colors)
-    return _without_crumbs(_surface(field, lambda *_: None))
+    return fused([(camera, sphere_depths(camera)) for camera in cameras_around(device)])
 
 
 @pytest.mark.parametrize(("past", "kept"), [(6, True), (20, False)])
 def test_a_surface_outlasts_some_views_that_see_past_it_but_not_many(past, kept, device):
     """Two views see a sheet at depth 2, the others what is at 2.9: a thin surface stays, a floater goes."""
     camera = cameras_around(device)[0]
-    depths = [torch.full((128, 128), z, device=device) for z in [2.0] * 2 + [2.9] * past]
-    field = DistanceField(VOXEL, 4 * VOXEL, device)
-    for depth in depths:
-        field.reserve(camera, depth, 10_000)
-    field.allocate()
-    for depth in depths:
-        field.fuse(camera, depth, torch.zeros(128, 128, 3, device=device))
-    mesh = _without_crumbs(_surface(field, lambda *_: None))
+    mesh = fused([(camera, torch.full((128, 128), z, device=device)) for z in [2.0] * 2 + [2.9] * past])
     viewmat = camera.viewmat.double().cpu().numpy()
     z = mesh.vertices @ viewmat[2, :3] + viewmat[2, 3]
     assert (np.abs(z - 2.9) < VOXEL).sum() > 1000

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 
 import nexwarp as nw
 from nexwarp.export.web.quantise import CHUNK, encode_chunks, encode_limits, encode_quats, morton_order
@@ -15,6 +16,7 @@ from nexwarp.model.detail_limits import NEVER
 from nexwarp.model.options import RenderOptions
 from tests.export.web import support
 from tests.export.web.support import named_cameras, read_sections, read_surfels, web_model
+from tests.reference.collect import rotations
 
 
 @cache
@@ -66,24 +68,14 @@ def test_rotations_return_the_same_surfel():
     quats = rng.standard_normal((2000, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     code, swapped = encode_quats(quats)
-    expected, actual = (_axes(x) for x in (quats, support.decode_quats(code).astype(np.float64)))
+    decoded = support.decode_quats(code).astype(np.float64)
+    expected, actual = (rotations(torch.from_numpy(x)).mT.numpy() for x in (quats, decoded))
     u, v = np.where(swapped[:, None, None], expected[:, [1, 0]], expected[:, :2]).transpose(1, 0, 2)
     for axis, wanted in ((actual[:, 0], u), (actual[:, 1], v), (actual[:, 2], expected[:, 2])):
         # Axes are lines: the surfel is the same with an axis reversed.
         angles = np.arccos(np.clip(np.abs((axis * wanted).sum(1)), 0, 1))
         assert angles.max() < 2e-3
     assert 0.2 < swapped.mean() < 0.8
-
-
-def _axes(quats: np.ndarray) -> np.ndarray:
-    """The axes of rotations, (N, 3 axes, 3)."""
-    w, x, y, z = quats.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-        [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-        [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
 
 
 def test_detail_limits_keep_their_ends():
