@@ -91,18 +91,12 @@ def main(arguments: list[str] | None = None) -> int:
     """Execute notebooks in order; 1 when one fails."""
     parser = argparse.ArgumentParser(prog="python -m notebooks", description="Execute the notebooks, outputs kept.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; all by default")
-    parser.add_argument("--short", action="store_true", help="small pictures and few steps: does everything run?")
     parser.add_argument("--out", type=Path, help="folder to write to (default: in place)")
     given = parser.parse_args(arguments)
     if unknown := sorted(set(given.names) - set(NAMES)):
         parser.error(f"NAME: expected some of {', '.join(NAMES)}, got {', '.join(unknown)}")
-    if given.short and given.out is None:
-        parser.error("--short: expected with --out, for the kept outputs are those of the long form")
     # The kernels inherit these: the package beside this folder, installed or not.
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(FOLDER.parent), os.environ.get("PYTHONPATH")]))
-    os.environ.pop("NEXWARP_SHORT", None)
-    if given.short:
-        os.environ["NEXWARP_SHORT"] = "1"
     if sys.platform == "win32":
         asyncio.set_event_loop_policy(asyncio.WindowsSelectorEventLoopPolicy())
     if given.out is not None:

@@ -1,4 +1,4 @@
-"""What the notebooks keep is what their code gives; `.ci/run` executes them whole, in their short form."""
+"""What the notebooks keep is what their code gives; `.ci/run` executes them whole."""
 
 import os
 import re
