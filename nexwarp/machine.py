@@ -78,20 +78,16 @@ def needed_memory(error: BaseException) -> str | None:
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Run torch's own loops on `count` threads; nexwarp's kernels keep theirs."""
+    """Run torch's own loops on `count` threads; nexwarp's kernels keep theirs.
+
+    How threads split a sum changes its rounding: what must be reproducible on any machine has one.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Run torch on one thread: how threads split a sum changes its rounding, and files must be reproducible."""
-    with torch_threads(1):
-        yield
 
 
 @contextmanager

@@ -61,19 +61,18 @@ def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     return [_looking(cameras[0], centre + offset, target, up) for offset in offsets]
 
 
-def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[Camera]:
+def spiral(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     """Return `count` cameras on a closed spiral among cameras that face one way.
 
-    In the frame of the mean camera, the path winds `turns` times around the mean centre and moves forward and back
-    once. Its radius along each axis is the distance within which 90 % of the cameras lie. All its cameras look at
+    In the frame of the mean camera, the path winds twice around the mean centre and moves forward and back once. Its
+    radius along each axis is the distance within which 90 % of the cameras lie. All its cameras look at
     `focus(cameras)`, or along the mean viewing direction if the focus is not in front of all cameras, upright as
     `up_direction`. All else is that of the first camera.
 
     Raises:
-        ValueError: cameras that do not face one way or share one centre; `count` or `turns` < 1.
+        ValueError: cameras that do not face one way or share one centre; `count` < 1.
     """
     check_range("count", count, 1)
-    check_range("turns", turns, 1)
     viewmats, centres = camera_poses(cameras)
     forward, up = viewmats[:, 2, :3].mean(0), up_direction(cameras)
     if forward.norm() < ONE_WAY:
@@ -88,27 +87,26 @@ def spiral(cameras: Sequence[Camera], count: int = 120, turns: int = 2) -> list[
         raise ValueError(f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place")
     target, share = focus_ahead(cameras)
     angles = torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
-    rounds = torch.stack([torch.cos(turns * angles), torch.sin(turns * angles), torch.sin(angles)], dim=1)
+    rounds = torch.stack([torch.cos(2 * angles), torch.sin(2 * angles), torch.sin(angles)], dim=1)
     places = centre + rounds * radii @ axes
     return [_looking(cameras[0], place, target if share == 1.0 else place + forward, up) for place in places]
 
 
-def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = None) -> list[Camera]:
+def interpolate(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     """Return `count` cameras on a smooth path from the first to the last of the given ones.
 
-    The path passes through key cameras: at most `keys` (None is one for every 10 of `count`), at even spacing in the
-    list, the first and last included. The time between two keys is proportional to their distance and rotation. Centres
+    The path passes through key cameras: at most one for every 10 of `count`, at even spacing in the list, the first
+    and last included. The time between two keys is proportional to their distance and rotation. Centres
     follow a cubic spline, rotations one of continuous angular acceleration. All else is that of the first camera.
 
     Raises:
-        ValueError: fewer than two distinct cameras, `count` < 1 or `keys` < 2.
+        ValueError: fewer than two distinct cameras, or `count` < 1.
     """
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
 
     check_range("count", count, 1)
-    keys = max(count // FRAMES_PER_KEY, 2) if keys is None else keys
-    check_range("keys", keys, 2)
+    keys = max(count // FRAMES_PER_KEY, 2)
     viewmats, centres = camera_poses(cameras)
     if len(cameras) > keys:
         chosen = torch.linspace(0, len(cameras) - 1, keys, dtype=torch.float64).round().long()

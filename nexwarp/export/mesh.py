@@ -8,6 +8,7 @@ from statistics import median
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.errors import RunError, SettingError
@@ -48,19 +49,12 @@ def extract_mesh(
     far: float | None = None,
     observe: Progress = lambda *_: None,
 ) -> Mesh:
-    """Return the surface of a model as a mesh, without components of less than 0.05 % of the triangles.
+    """Return the surface of a model that training cameras see, without components of less than 0.05 % of the triangles.
 
-    Args:
-        model: the model, on the device to work on.
-        cameras: the training cameras.
-        voxel: resolution of the mesh, world units; None is 1.5 pixels of the photos at their median depth.
-        far: surfaces at larger z-depths are left out, world units; None is 3 scene scales.
-        observe: called with each stage's name, how many views or blocks of it are done, and of how many.
-
-    Raises:
-        SettingError: `voxel` or `far` does not fit.
-        RunError: no camera sees a surface.
-        OutOfMemoryError: the voxels need more memory than there is.
+    `voxel`, the resolution, is 1.5 pixels of the photos at their median depth by default; surfaces are left out at
+    z-depths beyond `far`, 3 scene scales by default; both in world units. `observe` is called with each stage's name,
+    how many views or blocks of it are done, and of how many. SettingError: `voxel` or `far` does not fit. RunError: no
+    camera sees a surface. OutOfMemoryError: the voxels need more memory than there is.
     """
     for name, value in (("--voxel", voxel), ("--far", far)):
         if value is not None and not 0 < value < math.inf:
@@ -70,7 +64,9 @@ def extract_mesh(
     if far is None:
         far = FAR * float(scale) if isinstance(scale, (int, float)) else math.inf
     if voxel is None:
-        voxel = _pixel_size(model, cameras, far) * PIXELS_A_VOXEL
+        views = ((_depths(model, camera, far)[0], camera.focal) for camera in cameras)
+        sizes = [seen.median().item() / focal for depths, focal in views if len(seen := depths[depths > 0])]
+        voxel = median(sizes or [1.0]) * PIXELS_A_VOXEL
     field = DistanceField(voxel, TRUNCATION * voxel, model.device)
     try:
         for done, camera in enumerate(cameras, 1):
@@ -97,25 +93,13 @@ def _depths(model: Model, camera: Camera, far: float) -> tuple[torch.Tensor, tor
     return depths.where((out.alpha > LEAST_ALPHA) & (depths < far), 0.0), out.image.clamp(0, 1)
 
 
-def _pixel_size(model: Model, cameras: Sequence[Camera], far: float) -> float:
-    """Return the side of a pixel at the median depth, the median over the cameras; world units."""
-    sizes = []
-    for camera in cameras:
-        depths, _ = _depths(model, camera, far)
-        if len(seen := depths[depths > 0]):
-            sizes.append(seen.median().item() / camera.focal)
-    if not sizes:
-        raise RunError("mesh: expected surfaces that a training camera sees, found none")
-    return median(sizes)
-
-
 def _surface(field: DistanceField, observe: Progress) -> Mesh:
     """Return the zero level of a distance field where all corners of a cell are known; marching cubes by blocks."""
     from scipy.ndimage import map_coordinates
     from skimage.measure import marching_cubes
 
-    shape = (-1, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     neighbors = torch.stack([field.neighbors(corner) for corner in CORNERS], 1).cpu().numpy()
+    shape = (-1, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     distances, weights = (x.cpu().numpy().reshape(shape) for x in (field.distances, field.weights))
     colors = field.means.cpu().numpy().reshape(*shape, 4)[..., :3]
     origins = field.blocks.cpu().numpy() * BLOCK_SIDE
@@ -123,7 +107,7 @@ def _surface(field: DistanceField, observe: Progress) -> Mesh:
     total, count = 0, len(origins)
     for b, origin in enumerate(origins):
         volume, known = _bordered(distances, neighbors[b]), _bordered(weights, neighbors[b]) >= LEAST_WEIGHT
-        cells = np.logical_and.reduce([known[_cells(corner)] for corner in CORNERS])
+        cells = np.logical_and.reduce(sliding_window_view(known, (2, 2, 2)), axis=(3, 4, 5))
         if cells.any() and volume[known].min() < 0 < volume[known].max():
             volume = np.where(known, volume, 1.0)
             vertices, triangles, normals, _ = marching_cubes(volume, 0.0, gradient_direction="descent")
@@ -152,23 +136,16 @@ def _surface(field: DistanceField, observe: Progress) -> Mesh:
     )
 
 
-def _bordered(source: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
-    """Return a block of (B, 16, 16, 16, ...) values with one layer more: the first ones of its neighbours, or 0.
+def _bordered(blocks: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
+    """Return a block of (B, 16, 16, 16, ...) values with one layer more, of its neighbours or 0: (17, 17, 17, ...).
 
     The neighbours (8,) are the blocks at `CORNERS`, the block itself first; B where there is none.
     """
-    side = BLOCK_SIDE
-    out = np.zeros((side + 1, side + 1, side + 1, *source.shape[4:]), source.dtype)
-    for corner, block in zip(CORNERS, neighbors, strict=True):
-        if block < len(source):
-            there = tuple(slice(side, None) if beyond else slice(0, side) for beyond in corner)
-            out[there] = source[block][tuple(slice(0, 1) if beyond else slice(0, side) for beyond in corner)]
-    return out
-
-
-def _cells(corner: tuple[int, int, int]) -> tuple[slice, ...]:
-    """Slices of (17, 17, 17) values that select this corner of the (16, 16, 16) cells."""
-    return tuple(slice(first, first + BLOCK_SIDE) for first in corner)
+    parts = blocks[np.minimum(neighbors, len(blocks) - 1)]
+    parts[neighbors == len(blocks)] = 0
+    parts = np.moveaxis(parts.reshape(2, 2, 2, *blocks.shape[1:]), [0, 1, 2], [0, 2, 4])
+    whole = parts.reshape(*3 * [2 * BLOCK_SIDE], *blocks.shape[4:])
+    return whole[: BLOCK_SIDE + 1, : BLOCK_SIDE + 1, : BLOCK_SIDE + 1]
 
 
 def _without_crumbs(mesh: Mesh) -> Mesh:

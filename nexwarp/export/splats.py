@@ -85,18 +85,11 @@ def save_splats_ply(
     """Write surfels as Gaussians for viewers of 3D Gaussian splatting, without the texture and with gamma = 1.
 
     Each surfel becomes a flat Gaussian, whose third scale is a thousandth of the smaller of the other two, or several
-    of them where it is large for one of the cameras; these come last.
+    of them, which come last: a scale is at most `max_extent` of the distance to the nearest of the cameras. SH above
+    `sh_degree`, 0 to 3, are 0.
 
-    Properties: `x y z`, `nx ny nz`, `f_dc_0..2`, `f_rest_0..44` (0 above `sh_degree`), `opacity` (logit),
-    `scale_0..2` (logarithms), `rot_0..3` (wxyz, unit), all float32.
-
-    Args:
-        path: file to write, atomically.
-        surfels: the surfels, on any device.
-        sh_degree: largest SH degree to write, 0 to 3; higher coefficients are 0.
-        cameras: cameras to render accurately from; without any, each surfel is one Gaussian.
-        max_extent: largest scale of a Gaussian, as a fraction of its distance to the nearest camera; `math.inf` splits
-            nothing.
+    Properties: `x y z`, `nx ny nz`, `f_dc_0..2`, `f_rest_0..44`, `opacity` (logit), `scale_0..2` (logarithms),
+    `rot_0..3` (wxyz, unit), all float32.
     """
     raw = surfels.state_dict()
     pieces = split_large(surfels.means, surfels.scales, surfels.opacities, cameras, max_extent)

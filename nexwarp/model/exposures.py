@@ -14,7 +14,7 @@ from torch import nn
 from nexwarp.cameras.camera import Camera, StagedCamera
 from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.errors import check_tensors
-from nexwarp.machine import one_thread
+from nexwarp.machine import torch_threads
 
 DECIMALS = 6  # of log gains: rounding errors of the solver must not change a run
 MOST_PHOTOS = 1000  # largest number of photos that are kept
@@ -97,7 +97,7 @@ class Exposures(nn.Module):
         stride = -(-len(cameras) // MOST_PHOTOS)
         positions, directions = (x[::stride] for x in poses_of(viewmats))
         gains = log_gains.double()[::stride]
-        with one_thread():
+        with torch_threads(1):
             size = (positions - positions.mean(0)).square().sum(1).mean().sqrt().clamp_min(1e-12)  # RMS spread
             poses = torch.cat([positions, size * directions], 1)
             squares = torch.cdist(poses, poses).square()

@@ -9,7 +9,7 @@ from torch import nn
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.errors import check_range, check_tensors
-from nexwarp.machine import one_thread
+from nexwarp.machine import torch_threads
 
 # Terms of the series of sin(x) / x and the like: exact in double precision for angles of up to pi.
 TERMS = 14
@@ -135,7 +135,7 @@ def _gauge_directions(viewmats: torch.Tensor, pivots: torch.Tensor, scale: float
         columns += [torch.cat([turned, moved / scale], -1), torch.cat([torch.zeros_like(turned), turned], -1)]
     outward = -(rotations @ offsets[..., None])[..., 0] / scale
     columns.append(torch.cat([torch.zeros_like(outward), outward], -1))
-    with one_thread():  # the same bits whatever the number of cores
+    with torch_threads(1):  # the same bits whatever the number of cores
         basis, sizes, _ = torch.linalg.svd(torch.stack(columns, -1).flatten(0, 1), full_matrices=False)
     return basis[:, sizes > LEAST_SINGULAR * sizes[0]]
 
