@@ -87,7 +87,7 @@ class Camera:
     @property
     def pixel_focal(self) -> float:
         """Focal length of the image's pixels: `focal` may be lower, to limit the detail of the texture."""
-        return self.focal
+        return (self.fx * self.fy) ** 0.5
 
     @property
     def device(self) -> torch.device:
@@ -141,13 +141,13 @@ class StagedCamera(Camera):
     It has the size, near depth and dtype of `camera`, and zeros for numbers until `copy_`.
 
     Attributes:
-        numbers: (29,) viewmat, K, `focal` and a background colour of the camera that was copied last: one copy brings
-            them all. `fx` to `cy` are those of the first camera.
+        numbers: (30,) viewmat, K, `focal`, `pixel_focal` and a background colour of the camera that was copied last:
+            one copy brings them all. `fx` to `cy` are those of the first camera.
         falloff: (H, W, 1) falloff of the lens for that camera; None where the lens has none, or is not rendered.
     """
 
     def __init__(self, camera: Camera, device: torch.device, falloff: torch.Tensor | None = None) -> None:
-        self.numbers = torch.zeros(29, dtype=camera.viewmat.dtype, device=device)
+        self.numbers = torch.zeros(30, dtype=camera.viewmat.dtype, device=device)
         self.falloff = falloff
         viewmat, K = self.numbers[:16].view(4, 4), self.numbers[16:25].view(3, 3)
         checked = (camera.fx, camera.fy, camera.cx, camera.cy)
@@ -159,15 +159,20 @@ class StagedCamera(Camera):
         return self.numbers[25:26]
 
     @property
+    def pixel_focal(self) -> torch.Tensor:  # type: ignore[override]
+        """(1,) focal length of the image's pixels, on the device."""
+        return self.numbers[26:27]
+
+    @property
     def color(self) -> torch.Tensor:
         """(3,) background colour, on the device."""
-        return self.numbers[26:]
+        return self.numbers[27:]
 
     def copy_(self, camera: Camera, color: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
         """Overwrite all but the falloff with another camera of the same size and near depth, and a background."""
         dtype = self.numbers.dtype
         # From pageable memory, which is read before the copy returns.
-        scalars = torch.tensor([camera.focal, *color], dtype=dtype)
+        scalars = torch.tensor([camera.focal, camera.pixel_focal, *color], dtype=dtype)
         matrices = [camera.viewmat.detach().reshape(-1), camera.K.detach().to(dtype).reshape(-1)]
         if camera.device.type == "cpu":
             self.numbers.copy_(torch.cat([*matrices, scalars]), non_blocking=True)

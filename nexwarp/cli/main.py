@@ -16,7 +16,7 @@ from rich.console import Console
 
 from nexwarp.cli import __version__, display
 from nexwarp.cli.commands import Eval, Export, Info, Process, Render, ViewCommand, Warmup
-from nexwarp.cli.signals import deferred_stop, stopped_by_signals
+from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.errors import NexwarpError, RankError
 from nexwarp.io.files import printable
@@ -156,7 +156,7 @@ def _run(words: list[str], *, debug: bool) -> int:
                 word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")
             )
         if isinstance(command, Train) and (count := command.starts()):
-            with deferred_stop() as stop:
+            with stopped_by_signals(deferred=True) as stop:
                 return launch(count, [*PROGRAM, *words, *(["--debug"] if debug else [])], stop)
         console = OutputConsole()
         with display.plain_warnings(console):

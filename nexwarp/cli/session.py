@@ -15,7 +15,7 @@ from rich.console import Console
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.cli import display
 from nexwarp.cli.commands import evaluate_run, figures
-from nexwarp.cli.signals import Stopped, deferred_stop
+from nexwarp.cli.signals import Stopped, stopped_by_signals
 from nexwarp.errors import DivergedError, OutOfMemoryError, RunError, StorageError
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.machine import needed_memory
@@ -113,7 +113,7 @@ class Session(StageStore):
             if self.ranks.first:
                 show = stack.enter_context(bar)
                 stack.enter_context(log)
-            stop_signal = stack.enter_context(deferred_stop())
+            stop_signal = stack.enter_context(stopped_by_signals(deferred=True))
 
             def observe(step: StepReport) -> None:
                 if self.ranks.first:

@@ -1,4 +1,4 @@
-"""Atomic writes: a file exists complete or not at all, also after a power failure."""
+"""Atomic writes, complete or not at all even after a power failure; names for messages; a bound of file headers."""
 
 import errno
 import os
@@ -9,11 +9,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
-from nexwarp.errors import StorageError
+from nexwarp.errors import FormatError, StorageError
 
 TEMPORARY = re.compile(r"\..+\.(\d{1,9})-[0-9a-f]{16}\.tmp(\.[^.]*)?")
 MAX_STEM = 40  # characters of a file's stem in its temporary name; a file system may limit names to 255 bytes
 STALE_SECONDS = 600.0
+LONGEST_HEADER = 2**20  # bytes; that of a model has about 5,000
 # Errors of fsync on folders of file systems that cannot sync them, and of open on folders that may not be read.
 UNSYNCABLE = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
 
@@ -154,3 +155,14 @@ def sync(path: Path) -> None:
     except OSError as error:
         if not folder or error.errno not in UNSYNCABLE:
             raise
+
+
+def check_tensors_header(path: Path) -> None:
+    """Raise FormatError if a safetensors file's header is long: parsing one of 100,000 tensors takes seconds."""
+    with path.open("rb") as file:
+        size = int.from_bytes(file.read(8), "little")
+    # A file whose header would not fit is damaged, which its reader says.
+    if LONGEST_HEADER < size <= path.stat().st_size:
+        raise FormatError(
+            f"{path}: expected a safetensors header of at most {LONGEST_HEADER:,} bytes, a few tensors, got {size:,}"
+        )

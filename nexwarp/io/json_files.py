@@ -32,27 +32,27 @@ def write_json(path: Path, data: object) -> None:
     write_atomically(path, (json.dumps(data, indent=2, allow_nan=False) + "\n").encode())
 
 
-def read_json(path: Path, *, max_bytes: int = MAX_BYTES, finite: bool = False) -> Any:
-    """Parse a JSON file in UTF-8 of at most `max_bytes`; `finite` refuses NaN and Infinity, which JSON does not have.
+def read_json(path: Path, *, finite: bool = False) -> Any:
+    """Parse a JSON file in UTF-8 of at most `MAX_BYTES`; `finite` refuses NaN and Infinity, which JSON does not have.
 
     FileNotFoundError: no such file. ValueError: as of `parse_json`; the message names the file.
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file, expected JSON")
     size = path.stat().st_size
-    if size > max_bytes:
-        raise ValueError(f"{path}: expected at most {max_bytes:,} bytes of JSON, got {size:,}")
-    return parse_json(str(path), path.read_bytes(), max_bytes=max_bytes, finite=finite)
+    if size > MAX_BYTES:
+        raise ValueError(f"{path}: expected at most {MAX_BYTES:,} bytes of JSON, got {size:,}")
+    return parse_json(str(path), path.read_bytes(), finite=finite)
 
 
-def parse_json(where: str, content: bytes, *, max_bytes: int = MAX_BYTES, finite: bool = False) -> Any:
+def parse_json(where: str, content: bytes, *, finite: bool = False) -> Any:
     """Parse JSON in UTF-8; the caller has to check the type of what it uses. `where` names the content in messages.
 
     ValueError: the content is too long, has more than 500,000 lists and objects, is nested deeper than 64 levels, or is
     not JSON.
     """
-    if len(content) > max_bytes:
-        raise ValueError(f"{where}: expected at most {max_bytes:,} bytes of JSON, got {len(content):,}")
+    if len(content) > MAX_BYTES:
+        raise ValueError(f"{where}: expected at most {MAX_BYTES:,} bytes of JSON, got {len(content):,}")
     content = content.removeprefix(codecs.BOM_UTF8)
     steps = np.frombuffer(STRINGS.sub(b"", content).translate(STEPS, OTHERS), np.int8)
     # Each list or object takes about a microsecond and several hundred bytes, whatever it is used for.

@@ -124,30 +124,26 @@ def read_frames(path: str | os.PathLike[str]) -> Iterator["av.VideoFrame"]:
             if not container.streams.video:
                 raise FormatError(f"{path}: expected a video, but the file has no video stream")
             stream = container.streams.video[0]
-            _check_length(path, (container.duration or 0) / av.time_base, stream.frames)
-            _check_size(path, stream.width, stream.height)
+            seconds = (container.duration or 0) / av.time_base
+            _check_size(path, stream.width, stream.height, seconds, stream.frames)
             stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}
             stream.thread_type = "AUTO"
             for count, frame in enumerate(container.decode(stream), start=1):
-                _check_length(path, frame.time or 0.0, count)
-                _check_size(path, frame.width, frame.height)
+                _check_size(path, frame.width, frame.height, frame.time or 0.0, count)
                 yield frame
     except av.error.FFmpegError as error:
         known = f"; the formats {', '.join(CONTAINERS)} are read"
         raise FormatError(f"{path}: expected a video, could not decode it ({one_line(error)}){known}") from None
 
 
-def _check_size(path: str | os.PathLike[str], width: int, height: int) -> None:
+def _check_size(path: str | os.PathLike[str], width: int, height: int, seconds: float, count: int) -> None:
+    """Raise FormatError for frames of too many pixels, or too many frames."""
     if width * height > LARGEST_FRAME:
         limit = LARGEST_FRAME // 10**6
         raise FormatError(f"{path}: expected a video of at most {limit} megapixels, got {width}x{height}; reduce it")
-
-
-def _check_length(path: str | os.PathLike[str], seconds: float, count: int) -> None:
     if seconds > LONGEST or count > MOST_FRAMES:
-        raise FormatError(
-            f"{path}: expected a video of at most {LONGEST:,} s and {MOST_FRAMES:,} frames, got more; cut it"
-        )
+        expected = f"expected a video of at most {LONGEST:,} s and {MOST_FRAMES:,} frames"
+        raise FormatError(f"{path}: {expected}, got more; cut it")
 
 
 def frame_pixels(frame: "av.VideoFrame") -> np.ndarray:

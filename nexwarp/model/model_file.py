@@ -12,9 +12,8 @@ import torch
 
 from nexwarp.cameras.cameras_file import origin_of
 from nexwarp.errors import FormatError, MissingError, check_finite, check_range, check_tensors, check_version
-from nexwarp.io.files import one_line, write_atomically
+from nexwarp.io.files import check_tensors_header, one_line, write_atomically
 from nexwarp.io.json_files import Json, parse_json
-from nexwarp.io.safetensors_files import check_tensors_header
 from nexwarp.model.bounds import check_bounds, fits_half
 from nexwarp.model.compact import CODE_NAMES, STORED, decode, encode
 from nexwarp.model.compact import DTYPES as COMPACT_DTYPES

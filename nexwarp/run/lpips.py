@@ -9,7 +9,7 @@ from safetensors.torch import load_file
 from torch.nn.functional import conv2d, max_pool2d, normalize
 
 from nexwarp.errors import FormatError
-from nexwarp.io.safetensors_files import check_tensors_header
+from nexwarp.io.files import check_tensors_header
 
 # Convolutions of torchvision's `features` in five blocks; LPIPS compares what leaves each of them.
 BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import torch
 
 from nexwarp.errors import CheckpointError, MissingError, check_version
-from nexwarp.io.files import is_temporary, sync, temporary_name, write_atomically
+from nexwarp.io.files import check_tensors_header, is_temporary, sync, temporary_name, write_atomically
 from nexwarp.io.json_files import READ_ERRORS, read_json
-from nexwarp.io.safetensors_files import check_tensors_header
 
 CHECKPOINT_VERSION = 1
 CHECKPOINTS = ("checkpoint", "checkpoint.old")

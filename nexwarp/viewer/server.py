@@ -7,8 +7,7 @@ import io
 import logging
 import socket
 import warnings
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     import viser
@@ -16,26 +15,12 @@ if TYPE_CHECKING:
     from nexwarp.viewer.security import Gate
 
 
-@dataclass(frozen=True)
-class Server:
+class Server(NamedTuple):
     """A running server: viser's, the address to open, with the token if it needs one, and what admits connections."""
 
     viser: "viser.ViserServer"
     url: str
     gate: "Gate"
-
-    def waiting(self, client_id: int) -> int:
-        """Number of messages that a client has not taken yet; 0 for one that has left."""
-        server = self.viser._websock_server
-        state, connection = server._client_state_from_id.get(client_id), server._live_connections.get(client_id)
-        if state is None or connection is None:
-            return 0
-        return len(state.message_buffer.message_from_id) + connection.sending  # type: ignore[attr-defined]
-
-    def stop(self) -> None:
-        """Disconnect all browsers and stop."""
-        with contextlib.redirect_stdout(io.StringIO()):  # drops its message
-            self.viser.stop()
 
 
 def start_server(host: str, port: int) -> Server:

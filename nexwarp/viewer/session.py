@@ -1,16 +1,29 @@
-"""One browser tab: its view, its settings, its frustums and the state of its picture."""
+"""One browser tab: its view, its settings, its controls, its frustums and the state of its picture.
 
+The panel of each tab has values that are clamped to their ranges, and an editor of camera paths: views that a browser
+adds, to play and to keep for `nexwarp render --path`. Another one, of a training, is for all. Events that are
+coroutines run on viser's event loop, one after another. Functions would wait for a thread of its pool, in a queue
+without a limit.
+"""
+
+import asyncio
+import html
+import math
 import threading
 import time
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
-from nexwarp.viewer.modes import Settings
-from nexwarp.viewer.panel import Panel, set_changed
+from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.paths import interpolate
+from nexwarp.io.pictures import viridis
+from nexwarp.viewer.modes import BY_SLOT, MODES, RANGES, Picture, Settings
 from nexwarp.viewer.world import Viewpoint, camera_to_world, frustum_size, vertical_fov
 
 if TYPE_CHECKING:
@@ -18,15 +31,264 @@ if TYPE_CHECKING:
 
     from nexwarp.viewer.viewer import Viewer
 
+T = TypeVar("T")
 COLOURS = {"train": (64, 130, 240), "test": (245, 150, 40)}
 MOST_FRUSTUMS = 500
+FPS, PLAY_FPS = 30, 20  # of a camera path, as it is kept and played
+SECONDS = (0.1, 600.0)
+MOST_VIEWS = 200  # of a path
+FOV_DEGREES = (15.0, 110.0)
+SCREENSHOT_HEIGHTS = (64, 2160)
+TELL_SECONDS = 0.5  # between two updates of a training's status line
+# Settings with a control, its label and hint; `Settings` has the values of a checkbox, `RANGES` those of a slider.
+CONTROLS = (
+    ("slot", "Hit", "Rank of the hit that is shown; 1 has the largest weight"),
+    ("max_hits", "K", "Number of hits per pixel that use the neural texture"),
+    ("sh_degree", "SH degree", "Degree of the spherical harmonics; 0: no dependence on direction"),
+    ("as_trained", "Photo detail", "Leave out texture detail that is finer than the resolution of the photos"),
+    ("photo_exposure", "Photo exposure", "On: brightness and white balance of the nearby photos. Off: their mean"),
+)
+HELP = """\
+**Drag** orbit · **right drag** pan · **scroll** zoom
+
+**W A S D** fly · **Q E** down, up · **arrows** turn
+
+**Click a frustum** to go to the camera of its photo"""
+SMALL = "padding:0 0.8em 0.2em;font-size:0.85em;opacity:0.8"
+
+
+def on_change(control: "viser.GuiInputHandle[T]", act: Callable[[T], None]) -> None:
+    """Call `act` with each new value of a control."""
+
+    async def updated(event: "viser.GuiEvent[viser.GuiInputHandle[T]]") -> None:
+        act(event.target.value)
+
+    control.on_update(updated)
+
+
+def on_click(button: "viser.GuiButtonHandle", act: Callable[[], Awaitable[None] | None]) -> None:
+    """Call `act`, or await it, at each click."""
+
+    async def clicked(_: object) -> None:
+        done = act()
+        if done is not None:
+            await done
+
+    button.on_click(clicked)
+
+
+def set_changed(handle: object, name: str, value: object) -> None:
+    """Set a property of a control if that changes it."""
+    if getattr(handle, name) != value:
+        setattr(handle, name, value)
+
+
+def within(value: float, ends: tuple[float, float]) -> float:
+    """Clamp a number to a range; NaN and infinity become its lower end."""
+    return min(max(value, ends[0]), ends[1]) if math.isfinite(value) else ends[0]
+
+
+class PathEditor:
+    """A path through views of one client, and its controls."""
+
+    def __init__(self, session: "Session", save: Callable[[Sequence[Camera]], str]) -> None:
+        from viser import Icon
+
+        self.session, self.save = session, save
+        self.views: tuple[Camera, ...] = ()  # replaced, never changed: two threads read it
+        self.playing = False
+        gui = session.client.gui
+        self.note = gui.add_markdown("**Camera path** through views that you add, for `nexwarp render --path`")
+        on_click(gui.add_button("Add this view", icon=Icon.PLUS), self.add)
+        remove = gui.add_button("Remove the last", icon=Icon.BACKSPACE, color="gray")
+        on_click(remove, lambda: self._set_views(self.views[:-1]))
+        self.seconds = gui.add_number("Seconds", 6.0, min=SECONDS[0], max=SECONDS[1], step=0.1)
+        on_click(gui.add_button("Play, stop", icon=Icon.PLAYER_PLAY, color="gray"), self.play)
+        gui.add_button("Save path", icon=Icon.DEVICE_FLOPPY).on_click(lambda _: self.keep())  # on a thread: it writes
+
+    def add(self) -> None:
+        """Append the current view, with the size of the home view; video codecs need even sizes."""
+        here, home = self.session.viewpoint, self.session.home
+        if here is not None and len(self.views) < MOST_VIEWS:
+            size = (max(home.width // 2 * 2, 2), max(home.height // 2 * 2, 2))
+            (view,) = Viewpoint(here.pose, here.fov, *size).bands(1.0, 0.01, torch.zeros(0))
+            self._set_views((*self.views, view))
+
+    def _set_views(self, views: tuple[Camera, ...]) -> None:
+        self.views = views
+        self.note.content = f"{len(self.views)} of at most {MOST_VIEWS} views"
+
+    def path(self, fps: int) -> list[Camera]:
+        """Return the path at some frames a second; ValueError without two different views."""
+        return interpolate(self.views, max(round(within(self.seconds.value, SECONDS) * fps), 2), len(self.views) or 2)
+
+    async def play(self) -> None:
+        """Move along the path once; stop if that is in progress."""
+        self.playing = not self.playing
+        start = time.perf_counter()
+        try:
+            for number, camera in enumerate(self.path(PLAY_FPS) if self.playing else (), 1):
+                self.session.go(camera_to_world(camera), vertical_fov(camera))
+                await asyncio.sleep(max(start + number / PLAY_FPS - time.perf_counter(), 0.0))
+                if self.session.closed.is_set() or not self.playing:
+                    break
+        except ValueError:
+            self.note.content = "Add at least two different views first"
+        self.playing = False
+
+    def keep(self) -> None:
+        """Write the path into the run, and show the command that renders it."""
+        try:
+            self.note.content = f"`{self.save(self.path(FPS))}`"
+        except (OSError, ValueError) as error:
+            self.note.content = f"The path was not saved: {error}"
+
+
+class Panel:
+    """The controls of one client."""
+
+    def __init__(self, session: "Session") -> None:
+        self.session, self.gui = session, session.client.gui
+        self.controls: dict[str, viser.GuiInputHandle[Any]] = {}  # by the name of the setting
+        tabs = self.gui.add_tab_group(order=10.0)
+        with tabs.add_tab("Look"):
+            self._look()
+        with tabs.add_tab("Cameras"):
+            self._cameras()
+        with tabs.add_tab("Record"):
+            self._record()
+        self.gui.add_divider(order=15.0)
+        self.gui.add_markdown(HELP, order=20.0)
+
+    def _look(self) -> None:
+        gui, settings = self.gui, self.session.settings
+        mode = gui.add_dropdown("Show", tuple(MODES), initial_value=settings.mode)
+        self._connect(mode, "mode")
+        self.legend = gui.add_html("")
+        for name, label, hint in CONTROLS:
+            value = getattr(settings, name)
+            if name in RANGES:
+                low, high = RANGES[name]
+                self.controls[name] = gui.add_slider(label, low, high, 1, value, hint=hint)
+            else:
+                self.controls[name] = gui.add_checkbox(label, value, hint=hint)
+            self._connect(self.controls[name], name)
+        fov = within(round(float(np.rad2deg(self.session.home.fov))), FOV_DEGREES)
+        self.fov = gui.add_slider("Field of view", *FOV_DEGREES, 1.0, fov, hint="Vertical")
+        on_change(self.fov, self._set_fov)
+        self.status = gui.add_html("")
+        self.show(None, None)
+
+    def _set_fov(self, degrees: float) -> None:
+        self.session.client.camera.fov = float(np.deg2rad(within(degrees, FOV_DEGREES)))
+
+    def _connect(self, control: "viser.GuiInputHandle[T]", name: str) -> None:
+        """Make a control change a setting, and show the clamped value."""
+
+        def change(value: T) -> None:
+            try:
+                self.session.change(name, value)
+            except ValueError:  # a value that the panel does not offer
+                return
+            set_changed(control, "value", getattr(self.session.settings, name))
+            self.show(None, None)
+
+        on_change(control, change)
+
+    def _cameras(self) -> None:
+        from viser import Icon
+
+        gui, session = self.gui, self.session
+        home = session.home
+        on_click(gui.add_button("Back to the start", icon=Icon.HOME), lambda: session.go(home.pose, home.fov))
+        if not session.cameras:
+            gui.add_markdown("This run has no cameras.")
+            return
+        jump = gui.add_dropdown("Go to", tuple(session.cameras), hint="Go to the camera of a photo")
+        on_change(jump, session.jump)
+        on_click(gui.add_button("Go there", icon=Icon.CAMERA), lambda: session.jump(jump.value))
+        visible = gui.add_checkbox("Show cameras", True, hint="Blue: training views. Orange: test views.")
+        on_change(visible, lambda shown: set_changed(session.group, "visible", bool(shown)))
+
+    def _record(self) -> None:
+        from viser import Icon
+
+        gui, session = self.gui, self.session
+        gui.add_markdown("**Screenshot** of the current view, as PNG")
+        height = gui.add_number("Height", 1080, min=SCREENSHOT_HEIGHTS[0], max=SCREENSHOT_HEIGHTS[1], step=1)
+        shot = gui.add_button("Save screenshot", icon=Icon.PHOTO, hint="The width follows from the shape of the window")
+        on_click(shot, lambda: session.take_screenshot(int(within(height.value, SCREENSHOT_HEIGHTS))))
+        if session.viewer.save_path is not None:
+            gui.add_divider()
+            self.path = PathEditor(session, session.viewer.keep_path)
+
+    def show(self, picture: Picture | None, status: str | None) -> None:
+        """Show the legend of a picture, None before the first one, and a status line; None keeps the present one."""
+        mode = self.session.settings.mode
+        text = html.escape(MODES[mode])
+        if picture is not None and picture.span is not None:
+            low, high = picture.span
+            stops = (viridis()[::17] * 255).round().int().tolist()
+            gradient = ",".join(f"rgb({r},{g},{b})" for r, g, b in stops)
+            text += (
+                '<div style="height:0.6em;border-radius:0.2em;margin-top:0.4em;'
+                f'background:linear-gradient(to right,{gradient})"></div>'
+                f'<div style="display:flex;justify-content:space-between"><span>{low:.3g}</span>'
+                f"<span>{high:.3g}</span></div>"
+            )
+        set_changed(self.legend, "content", f'<div style="{SMALL}">{text}</div>')
+        if status is not None:
+            set_changed(self.status, "content", f'<div style="{SMALL}">{html.escape(status)}</div>')
+        set_changed(self.controls["slot"], "visible", mode in BY_SLOT)
+
+
+class TrainingPanel:
+    """The controls of a training: progress and pause."""
+
+    def __init__(self, gui: "viser.GuiApi", total: int, wake: Callable[[], None]) -> None:
+        """Add the controls of a training of `total` iterations; `wake` is called when it is paused or resumed."""
+        from viser import Icon
+
+        self.total, self.wake = total, wake
+        self.paused = False  # held between two steps
+        self._last: tuple[float, int] | None = None  # time and step of the last status line
+        with gui.add_folder("Training", order=0.0):
+            self.progress = gui.add_progress_bar(0.0)
+            self.status = gui.add_markdown("starting")
+            self.pause = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
+        on_click(self.pause, self.toggle_pause)
+
+    def toggle_pause(self) -> None:
+        """Pause the training, or resume it."""
+        self.paused = not self.paused
+        self.pause.label = "Resume" if self.paused else "Pause"
+        self.wake()
+
+    def tell(self, step: int, describe: Callable[[], str], now: float, force: bool = False) -> None:
+        """Show the step and the line of `describe`, unless that was done within `TELL_SECONDS` before `now`."""
+        if not force and self._last is not None and now - self._last[0] < TELL_SECONDS:
+            return
+        how = "paused" if self.paused else "training"
+        if self._last is not None and not self.paused and now > self._last[0]:
+            how = f"{(step - self._last[1]) / (now - self._last[0]):.1f} it/s"
+        set_changed(self.progress, "value", 100.0 * step / max(self.total, 1))
+        self.status.content = f"**{step:,}** of {self.total:,} · {how}  \n{describe()}"
+        self._last = (now, step)
+
+    def finish(self, text: str) -> None:
+        """Resume a paused training, show a status line, and hide the controls."""
+        self.paused = False
+        self.status.content = text
+        set_changed(self.progress, "value", 100.0)
+        self.pause.visible = False
 
 
 class Session:
     """The state of a client. viser's event loop calls its methods; another thread draws its pictures."""
 
-    def __init__(self, viewer: "Viewer", client: "viser.ClientHandle", settings: Settings) -> None:
-        self.viewer, self.client, self.settings = viewer, client, settings
+    def __init__(self, viewer: "Viewer", client: "viser.ClientHandle") -> None:
+        self.viewer, self.client = viewer, client
+        self.settings = Settings(max_hits=viewer.model().options.max_hits)
         self.world, self.cameras, self.home = viewer.world, viewer.cameras, viewer.home
         self.viewpoint: Viewpoint | None = None
         self.version = 0
@@ -41,8 +303,12 @@ class Session:
         self._take_over(client.camera)
 
     def waiting(self) -> int:
-        """Number of messages that the client has not taken yet."""
-        return self.viewer.web.waiting(self.client.client_id)
+        """Number of messages that the client has not taken yet; 0 if it has left."""
+        server, client = self.viewer.server._websock_server, self.client.client_id
+        state, connection = server._client_state_from_id.get(client), server._live_connections.get(client)
+        if state is None or connection is None:
+            return 0
+        return len(state.message_buffer.message_from_id) + connection.sending  # type: ignore[attr-defined]
 
     async def _moved(self, camera: "viser.CameraHandle") -> None:
         self._take_over(camera)
@@ -121,14 +387,9 @@ class Session:
     async def _clicked(self, name: str, _: object) -> None:
         self.jump(name)
 
-    def show_cameras(self, visible: bool) -> None:
-        """Show or hide the frustums."""
-        self.group.visible = bool(visible)
-
     def _hide_near(self) -> None:
         """Hide the frustums around the browser's camera, which would cover the view."""
-        if self.viewpoint is None:
-            return
+        assert self.viewpoint is not None
         eye = self.world.to_browser(self.viewpoint.pose[:3, 3])
         far = np.linalg.norm(self.places - eye, axis=1) > 1.5 * self.frustum_size
         frustums = list(self.frustums.values())

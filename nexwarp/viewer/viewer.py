@@ -1,5 +1,6 @@
 """The viewer: draws pictures for all connected browsers, on its own or between the steps of a training."""
 
+import contextlib
 import io
 import logging
 import math
@@ -18,9 +19,8 @@ from nexwarp.io.files import one_line
 from nexwarp.model.model import Model
 from nexwarp.viewer import pacing
 from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
-from nexwarp.viewer.panel import TrainingPanel
 from nexwarp.viewer.server import start_server
-from nexwarp.viewer.session import Session
+from nexwarp.viewer.session import Session, TrainingPanel
 from nexwarp.viewer.world import Viewpoint, World, clearest
 
 if TYPE_CHECKING:
@@ -78,14 +78,13 @@ class Viewer:
         self.step = self.paths = 0
         self.training: TrainingPanel | None = None
         self._news, self._lock = threading.Event(), threading.Lock()
-        self.web = start_server(options.host, options.port)
-        self.server, self.url = self.web.viser, self.web.url
+        self.server, self.url, self.gate = start_server(options.host, options.port)
         self._set_scene()
         if options.total is not None:
             self.training = TrainingPanel(self.server.gui, options.total, self.wake)
         self.server.on_client_disconnect(self._goodbye)
         self.server.on_client_connect(self._welcome)
-        self.web.gate.is_open = True
+        self.gate.is_open = True
 
     def __enter__(self) -> "Viewer":
         return self
@@ -97,7 +96,8 @@ class Viewer:
         """Disconnect all browsers and stop the server."""
         for session in list(self.sessions.values()):
             session.closed.set()
-        self.web.stop()
+        with contextlib.redirect_stdout(io.StringIO()):  # drops viser's message
+            self.server.stop()
 
     def wake(self) -> None:
         """Say that a new picture is needed."""
@@ -106,8 +106,9 @@ class Viewer:
     def show(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Draw pictures for the connected browsers until `stop()` returns True or Ctrl-C."""
         if not self.pace.seconds_per_pixel:  # compiles the kernels before a browser connects
+            settings = Settings(max_hits=self.model().options.max_hits)
             for _ in range(2):
-                self._picture(self.home, pacing.SMALLEST / min(self.home.width, self.home.height), self._settings())
+                self._picture(self.home, pacing.SMALLEST / min(self.home.width, self.home.height), settings)
         while not stop():
             self._draw_or_wait()
 
@@ -262,7 +263,7 @@ class Viewer:
         try:
             with self._lock:  # one of the first clients reads the photos
                 self._read_photos()
-            session = Session(self, client, self._settings())
+            session = Session(self, client)
             with self._lock:
                 if client.client_id in self.server.get_clients():  # else it has disconnected
                     self.sessions[client.client_id] = session
@@ -297,10 +298,6 @@ class Viewer:
                 raise ValueError(f"a viewer writes at most {MOST_PATHS} paths into the run")
             self.paths += 1
         return self.save_path(path)
-
-    def _settings(self) -> Settings:
-        """Initial settings of a client: the model's own K."""
-        return Settings(max_hits=self.model().options.max_hits)
 
 
 def _kind(settings: Settings) -> tuple[bool, int]:

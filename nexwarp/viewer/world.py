@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -119,16 +119,17 @@ class Viewpoint:
         return cameras
 
 
-@dataclass(frozen=True)
 class LimitedCamera(Camera):
     """A camera with an upper limit, in pixels, on the focal length by which the texture's levels are weighted."""
 
-    focal_limit: float = math.inf
+    def __init__(self, *arguments: Any, focal_limit: float = math.inf, **others: Any) -> None:
+        super().__init__(*arguments, **others)
+        self.focal_limit = focal_limit
 
     @property
     def focal(self) -> float:
         """Focal length for the weights of the texture's levels (paper Eq. 4), pixels."""
-        return min(super().focal, self.focal_limit)
+        return min(self.pixel_focal, self.focal_limit)
 
 
 def clearest(cameras: Sequence[Camera]) -> Camera:

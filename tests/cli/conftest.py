@@ -9,7 +9,6 @@ import pytest
 from nexwarp.cli import main as cli
 from nexwarp.train import recipe
 from tests.cli.support import FLAGS, SMALL
-from tests.scene_writers import write_demo
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +20,8 @@ def small_preset(one_torch_thread: None) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=48, height=36, views=10, points=200)
+def scene(tiny_folder: Path) -> Path:
+    return tiny_folder
 
 
 @pytest.fixture(scope="module")

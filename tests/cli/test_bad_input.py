@@ -45,34 +45,19 @@ def refuses(tmp_path, capsys) -> Callable[..., None]:
         (["--masks", "absent"], ["masks: no folder 'absent'"]),
         (["--points", "nowhere.ply"], ["nowhere.ply: no such file, expected a PLY file"]),
         (["--format", "blender"], ["expected transforms_train.json of a Blender scene"]),
+        (["--resume"], ["new", "expected a run to resume"]),
     ],
 )
 def test_flags_that_cannot_be(scene, refuses, flags, words):
     refuses(scene, flags, *words)
 
 
-def test_folders_without_a_scene(tmp_path, refuses):
+def test_folders_without_a_scene_or_photos(tmp_path, refuses):
     refuses(tmp_path / "nowhere", [], f"{tmp_path / 'nowhere'}", "no such folder", "expected a scene")
     (tmp_path / "empty").mkdir()
     refuses(tmp_path / "empty", [], f"{tmp_path / 'empty'}", "no scene found", "a COLMAP model", "transforms.json")
     folder = make_scene(tmp_path / "no photos", names=[])
     refuses(folder, [], str(folder), "no registered images")
-
-
-def test_no_images_folder(tmp_path, refuses):
-    folder = make_scene(tmp_path / "scene")
-    shutil.rmtree(folder / "images")
-    refuses(folder, [], "images", str(folder))
-    refuses(folder, ["--images", "images_4"], "images_4", str(folder))
-
-
-def test_absent_photo(tmp_path, refuses):
-    folder = make_scene(tmp_path / "scene")
-    (folder / "images" / "03.png").unlink()
-    refuses(folder, [], str(folder), "of 10 photos: image not found: 03.png; --skip-missing")
-
-
-def test_truncated_photo(tmp_path, refuses):
     folder = make_scene(tmp_path / "scene")
     photo = folder / "images" / "03.png"
     photo.write_bytes(photo.read_bytes()[:2000])
@@ -80,6 +65,11 @@ def test_truncated_photo(tmp_path, refuses):
     photo.write_text("no image")
     refuses(folder, [], f"{photo}: expected a complete image file, could not decode it: no format is known")
     refuses(photo, [], f"{photo}: expected the folder of a scene, got a file; give {photo.parent}")
+    photo.unlink()
+    refuses(folder, [], str(folder), "of 10 photos: image not found: 03.png; --skip-missing")
+    shutil.rmtree(folder / "images")
+    refuses(folder, [], "images", str(folder))
+    refuses(folder, ["--images", "images_4"], "images_4", str(folder))
 
 
 def test_lens_that_is_no_number(tmp_path, refuses):
@@ -93,10 +83,6 @@ def test_no_cuda_when_asked_for(scene, finished, refuses, capsys):
     refuses(scene, ["--device", "cuda"], "--device", "no CUDA device", "--device cpu")
     for command in ("eval", "render"):
         refused(capsys, [command, str(finished), "--device", "cuda"], "--device", "no CUDA device")
-
-
-def test_nothing_to_resume(scene, refuses, tmp_path):
-    refuses(scene, ["--resume"], str(tmp_path / "runs" / "new"), "expected a run to resume")
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"scene": {}}', '{"scene": {"path": 3}, "config": {}}', "\x00"])

@@ -19,10 +19,8 @@ from tests.cli.support import FLAGS, RUN_FILES, read, refused, snapshot
 pytestmark = pytest.mark.usefixtures("small_preset")
 
 
-def interrupt_after(
-    patch: pytest.MonkeyPatch, owner: type, method: str, calls: int, number: int = signal.SIGINT
-) -> None:
-    """Press Ctrl-C (or send another signal), once, in the given call of a method."""
+def interrupt_after(patch: pytest.MonkeyPatch, owner: type, method: str, calls: int, number: int) -> None:
+    """Press Ctrl-C, or send another signal, once, in the given call of a method."""
     original: Callable[..., Any] = getattr(owner, method)
     count = iter(range(1, 1_000_000))
 
@@ -35,44 +33,34 @@ def interrupt_after(
 
 
 @pytest.mark.parametrize(
-    ("owner", "method", "calls"),
+    ("owner", "method", "calls", "name"),
     [
-        (TrainingLog, "__call__", 7),  # between two steps
-        (TrainingLog, "__call__", 1),  # before there is any checkpoint
-        (DensityControl, "accumulate", 5),  # after a backward pass, before the optimizer steps
-        (FusedAdam, "step", 8),
+        (TrainingLog, "__call__", 7, "SIGINT"),  # between two steps
+        (TrainingLog, "__call__", 1, "SIGINT"),  # before there is any checkpoint
+        (DensityControl, "accumulate", 5, "SIGINT"),  # after a backward pass, before the optimizer steps
+        (FusedAdam, "step", 8, "SIGINT"),
+        (FusedAdam, "step", 7, "SIGTERM"),
+        (FusedAdam, "step", 7, "SIGHUP"),
     ],
 )
-def test_an_interrupted_run_resumes_to_the_same_bits(trained, scene, tmp_path, capsys, owner, method, calls):
+def test_an_interrupted_run_resumes_to_the_same_bits(trained, scene, tmp_path, capsys, owner, method, calls, name):
     """Ctrl-C anywhere in a step, then --resume: the same model, byte for byte, as of the run that was left alone."""
-    run = tmp_path / "run"
+    run, number = tmp_path / "run", getattr(signal, name)
+    before = signal.getsignal(number)
     with pytest.MonkeyPatch.context() as patch:
-        interrupt_after(patch, owner, method, calls)
-        assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == 130
-    assert capsys.readouterr().err == "nexwarp: interrupted; continue with --resume\n"
+        interrupt_after(patch, owner, method, calls, number)
+        assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == 128 + number
+    word = "interrupted" if name == "SIGINT" else "terminated"
+    assert capsys.readouterr().err == f"nexwarp: {word}; continue with --resume\n"
     assert {f.name for f in run.iterdir()} - {"checkpoint.old"} == {"config.json", "metrics.jsonl", "checkpoint"}
     assert read(run / "checkpoint", "state.json")["iteration"] == calls
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(number) == before
     assert cli.main(["train", str(scene), "--run", str(run), "--device", "cpu", "--resume"]) == 0
     assert f"resumed at iteration {calls}" in capsys.readouterr().out
     assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
     expected, metrics = read(trained, "metrics.json"), read(run, "metrics.json")
     for key in ("psnr", "ssim", "views", "iterations", "surfels"):
         assert metrics[key] == expected[key], key
-
-
-@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129)])
-def test_other_signals_stop_in_order_too(trained, scene, tmp_path, capsys, name, code):
-    number = getattr(signal, name)
-    before, run = signal.getsignal(number), tmp_path / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        interrupt_after(patch, FusedAdam, "step", 7, number)
-        assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == code
-    assert capsys.readouterr().err == "nexwarp: terminated; continue with --resume\n"
-    assert read(run / "checkpoint", "state.json")["iteration"] == 7
-    assert signal.getsignal(number) == before
-    assert cli.main(["train", str(scene), "--run", str(run), "--device", "cpu", "--resume"]) == 0
-    assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
 
 
 def test_checkpoints_come_as_often_as_asked_and_two_are_kept(trained, scene, tmp_path, monkeypatch, capsys):
@@ -93,25 +81,15 @@ def test_checkpoints_come_as_often_as_asked_and_two_are_kept(trained, scene, tmp
     refused(capsys, [*command, "--overwrite", "--checkpoint-every", "0"], "--checkpoint-every", "at least 1", "got 0")
 
 
-@pytest.mark.parametrize("damage", ["cut", "flip", "state", "missing"])
-def test_a_damaged_checkpoint_gives_way_to_the_one_before(trained, scene, finished, capsys, damage):
-    tensors, state = (finished / "checkpoint" / name for name in ("tensors.safetensors", "state.json"))
-    content = tensors.read_bytes()
-    if damage == "cut":
-        tensors.write_bytes(content[: len(content) // 2])
-    elif damage == "flip":
-        tensors.write_bytes(content[:-7] + bytes([content[-7] ^ 1]) + content[-6:])
-    elif damage == "state":
-        state.write_text(state.read_text().replace('"iteration": 20', '"iteration": 21'))
-    else:
-        state.unlink()
+def test_a_damaged_checkpoint_gives_way_to_the_one_before(trained, scene, finished, capsys):
+    tensors = finished / "checkpoint" / "tensors.safetensors"
+    tensors.write_bytes(tensors.read_bytes()[:-7])
     (finished / "model.safetensors").unlink()
     capsys.readouterr()
     assert cli.main(["train", str(scene), "--run", str(finished), "--device", "cpu", "--resume"]) == 0
     out = capsys.readouterr().out
-    assert (
-        f"warning: {finished / 'checkpoint'}: expected a whole checkpoint" in out and "resumed at iteration 18" in out
-    )
+    assert f"warning: {finished / 'checkpoint'}: expected a whole checkpoint" in out
+    assert "resumed at iteration 18" in out
     assert (finished / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
 
 
@@ -160,24 +138,6 @@ def test_resuming_removes_what_killed_processes_left(finished, scene):
     assert cli.main(["train", str(scene), "--run", str(finished), "--device", "cpu", "--resume"]) == 0
     assert before.keys() - snapshot(finished).keys() == set(goes)
     assert not (finished / "export").exists()
-
-
-def test_a_run_whose_overwriting_was_killed_is_a_run_still(finished, scene, monkeypatch):
-    """The old config goes last."""
-
-    class Killed(BaseException):
-        pass
-
-    def kill(*_: Any) -> None:
-        raise Killed
-
-    command = ["train", str(scene), "--run", str(finished), *FLAGS]
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", kill)
-        with pytest.raises(Killed):
-            cli.main([*command, "--overwrite"])
-    assert {f.name for f in finished.iterdir()} == {"config.json"}
-    assert cli.main([*command, "--resume"]) == 0
 
 
 def test_a_resumed_run_knows_where_its_scene_lies_now(finished, scene, tmp_path):

@@ -24,9 +24,6 @@ from tests.scene_writers import write_blender, write_points
 pytestmark = pytest.mark.usefixtures("small_preset")
 
 
-# A run
-
-
 LINKS = {"follow_links": False, "skip_missing": False}
 
 
@@ -127,7 +124,7 @@ def test_render_needs_no_photos(scene, tmp_path, capsys):
     assert cli.main(["train", str(moved), "--run", str(run), *FLAGS, "--iterations", "2"]) == 0
     tests = snapshot(run / "renders" / "test")
     shutil.rmtree(run / "renders")
-    moved.rename(tmp_path / "elsewhere")
+    shutil.rmtree(moved)
     capsys.readouterr()
     assert cli.main(["render", str(run), "--frames", "3", "--device", "cpu"]) == 0
     assert "5 pictures" in capsys.readouterr().out

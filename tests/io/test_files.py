@@ -11,14 +11,7 @@ import torch
 
 from nexwarp.errors import StorageError
 from nexwarp.io import files
-from nexwarp.io.files import (
-    is_abandoned,
-    is_temporary,
-    temporary_name,
-    write_atomically,
-    write_together,
-    written_aside,
-)
+from nexwarp.io.files import is_abandoned, is_temporary, temporary_name, write_atomically, write_together, written_aside
 from nexwarp.run.folder import keep_camera_path
 from nexwarp.run.log import _open_log
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
@@ -30,39 +23,28 @@ def test_temporary_names_are_unpredictable_and_known_again(tmp_path):
     names = {temporary_name(tmp_path / "a.b.json").name for _ in range(100)}
     assert len(names) == 100 and all(is_temporary(name) and name.endswith(".tmp.json") for name in names)
     assert is_temporary(temporary_name(tmp_path / "checkpoint").name)
-    for name in (
-        ".a.12.tmp.json",
-        ".notes.tmp",
-        "a.12-0123456789abcdef.tmp",
-        ".a.12-0123456789abcde.tmp",
-        ".a.tmp.b.c",
-    ):
-        assert not is_temporary(name), name
+    others = (".a.12.tmp.json", ".notes.tmp", "a.12-0123456789abcdef.tmp", ".a.12-0123456789abcde.tmp", ".a.tmp.b.c")
+    assert not any(is_temporary(name) for name in others)
 
 
-def test_a_link_under_the_old_predictable_name_is_not_written_through(tmp_path):
-    precious = tmp_path / "precious"
+def test_links_are_not_written_through(tmp_path, monkeypatch):
+    """Neither one under an old predictable name, nor under a temporary one if it were known, nor at a log's place."""
+    precious, run = tmp_path / "precious", tmp_path / "run"
     precious.write_text("years of work")
-    run = tmp_path / "run"
     run.mkdir()
-    (run / f".config.{os.getpid()}.tmp.json").symlink_to(precious)
+    trap = run / ".file.1-0000000000000000.tmp"
+    for link in (run / f".config.{os.getpid()}.tmp.json", run / "metrics.jsonl", trap):
+        link.symlink_to(precious)
     (run / "checkpoint.tmp").symlink_to(tmp_path / "elsewhere")
     write_atomically(run / "config.json", b"{}")
     save_checkpoint(run, {"x": torch.ones(1)}, {"iteration": 1})
-    assert precious.read_text() == "years of work" and not (tmp_path / "elsewhere").exists()
     assert (run / "config.json").read_bytes() == b"{}" and load_checkpoint(run)[1] == {"iteration": 1}
-
-
-def test_a_temporary_file_is_always_a_new_one(tmp_path, monkeypatch):
-    """Even if the name were known: a link that stands there is an error, and stays."""
-    precious = tmp_path / "precious"
-    precious.write_text("years of work")
-    trap = tmp_path / ".file.1-0000000000000000.tmp"
-    trap.symlink_to(precious)
+    with pytest.raises(OSError, match="symbolic links"):
+        _open_log(run / "metrics.jsonl")
     monkeypatch.setattr(files, "temporary_name", lambda _: trap)
     with pytest.raises(StorageError, match="File exists"):
-        write_atomically(tmp_path / "file", b"new")
-    assert precious.read_text() == "years of work"
+        write_atomically(run / "file", b"new")
+    assert precious.read_text() == "years of work" and not (tmp_path / "elsewhere").exists()
 
 
 def test_long_names_leave_room_for_what_a_temporary_name_adds(tmp_path):
@@ -82,13 +64,6 @@ def test_a_temporary_file_is_abandoned_when_it_is_old_and_its_process_is_gone(tm
     assert not is_abandoned(file(2**22 + 1, 10))  # perhaps of another host
     assert not is_abandoned(file(os.getppid(), 3600))
     assert is_abandoned(file(os.getpid(), 3600))  # of an earlier process with this number: in a container all have one
-
-
-def test_a_log_is_not_appended_to_through_a_link(tmp_path):
-    (tmp_path / "precious").touch()
-    (tmp_path / "metrics.jsonl").symlink_to(tmp_path / "precious")
-    with pytest.raises(OSError, match="symbolic links"):
-        _open_log(tmp_path / "metrics.jsonl")
 
 
 def test_folders_of_a_failed_write_are_removed(tmp_path):

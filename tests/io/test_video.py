@@ -27,6 +27,12 @@ def frames(count: int, width: int, height: int) -> list[torch.Tensor]:
     return out
 
 
+def write_frames(path: Path, count: int = 1, width: int = 32, height: int = 32) -> None:
+    with video_writer(path, width, height) as append:
+        for frame in frames(count, width, height):
+            append(frame)
+
+
 def decode(path: Path) -> tuple[list[torch.Tensor], Any]:
     with av.open(str(path)) as container:
         (stream,) = container.streams.video
@@ -58,8 +64,7 @@ def test_video_holds_the_frames(tmp_path: Path, name: str, fps: float, rate: Fra
 
 
 def test_odd_sizes_lose_one_row_and_column(tmp_path: Path) -> None:
-    with video_writer(tmp_path / "a.mp4", 51, 37) as append:
-        append(frames(1, 51, 37)[0])
+    write_frames(tmp_path / "a.mp4", 1, 51, 37)
     decoded, (rate, _, _) = decode(tmp_path / "a.mp4")
     assert [x.shape for x in decoded] == [(36, 50, 3)] and rate == 30
 
@@ -192,12 +197,10 @@ PLAYLISTS = {
 @pytest.mark.parametrize("kind", PLAYLISTS)
 @pytest.mark.timeout(60)
 def test_playlists_behind_the_name_of_a_video_are_not_followed(tmp_path: Path, kind: str) -> None:
-    with video_writer(tmp_path / "clip.mp4", 32, 32) as append:
-        append(frames(1, 32, 32)[0])
+    write_frames(tmp_path / "clip.mp4")
     (tmp_path / "walk.mp4").write_text(PLAYLISTS[kind].format(clip="clip.mp4"))
-    with pytest.raises(
-        FormatError, match=r"walk\.mp4: expected a video, could not decode it .*; the formats mov, mp4, .* are read"
-    ):
+    message = r"walk\.mp4: expected a video, could not decode it .*; the formats mov, mp4, .* are read"
+    with pytest.raises(FormatError, match=message):
         next(read_frames(tmp_path / "walk.mp4"))
 
 
@@ -210,9 +213,7 @@ def test_playlists_behind_the_name_of_a_video_are_not_followed(tmp_path: Path, k
     ],
 )
 def test_videos_have_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: float, message: str):
-    with video_writer(tmp_path / "a.mp4", 32, 32) as append:
-        for frame in frames(5, 32, 32):
-            append(frame)
+    write_frames(tmp_path / "a.mp4", 5)
     monkeypatch.setattr(video, limit, value)
     with pytest.raises(FormatError, match=message):
         list(read_frames(tmp_path / "a.mp4"))

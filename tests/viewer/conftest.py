@@ -7,8 +7,7 @@ import pytest
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.train import recipe
-from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
-from tests.scene_writers import write_demo
+from tests.cli.support import FLAGS, SMALL
 from tests.scenes import intrinsics, make_camera, make_surfels, make_texture, random_scene
 from tests.viewer.support import OPTIONS
 
@@ -25,13 +24,10 @@ def camera() -> nw.Camera:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
+def run(tiny_folder, tmp_path_factory) -> Path:
     """A tiny finished run."""
-    folder = tmp_path_factory.mktemp("viewer")
-    scene = write_demo(folder / "tiny", width=48, height=36, views=10, points=200)
-    small = Config(texture=TextureConfig(levels=4, table_size=2**10, width=16), densify=DensifyConfig(every=3))
+    folder = tmp_path_factory.mktemp("viewer") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(recipe.PRESETS, "default", small)
-        flags = ["--iterations", "20", "--max-surfels", "100", "--device", "cpu"]
-        assert cli.main(["train", str(scene), "--run", str(folder / "run"), *flags]) == 0
-    return folder / "run"
+        patch.setitem(recipe.PRESETS, "default", SMALL)
+        assert cli.main(["train", str(tiny_folder), "--run", str(folder), *FLAGS]) == 0
+    return folder

@@ -12,6 +12,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+import psutil
 import pytest
 
 from nexwarp.errors import OutOfMemoryError
@@ -139,7 +140,7 @@ def test_200_clients_are_served_or_refused_with_a_reason(model):
         finally:
             for client in served:
                 client.socket.close()
-        wait_for(lambda: not viewer.web.gate.clients)
+        wait_for(lambda: not viewer.gate.clients)
         with Client(viewer) as late:
             late.look()
             assert late.picture().ndim == 3
@@ -149,7 +150,7 @@ def test_connections_that_say_nothing_are_bounded_and_lock_nobody_out(model):
     with serving(model) as viewer, Client(viewer) as early:
         url = urlsplit(viewer.url)
         silent = [socket.create_connection((str(url.hostname), int(url.port or 0))) for _ in range(200)]
-        gate = viewer.web.gate
+        gate = viewer.gate
         wait_for(lambda: len(gate.connections) == security.MAX_CONNECTIONS)
         time.sleep(0.1)
         assert len(gate.connections) == security.MAX_CONNECTIONS, "the others are closed"
@@ -212,52 +213,33 @@ def test_no_error_of_the_viewer_ends_a_training(model, monkeypatch, error, where
                     thread.join()
 
 
-def resources() -> dict[str, int]:
-    """Open files, threads and resident bytes of this process."""
-    import psutil
-
-    process = psutil.Process()
-    files = process.num_fds() if os.name == "posix" else process.num_handles()
-    return {"files": files, "threads": process.num_threads(), "bytes": process.memory_info().rss}
-
-
-def clients() -> list[object]:
+def clients() -> dict[int, object]:
     """All objects that stand for a client."""
     viser = pytest.importorskip("viser")
     kinds = {Session, viser.ClientHandle, security.Connection}
-    return [thing for thing in gc.get_objects() if type(thing) in kinds]
+    return {id(thing): thing for thing in gc.get_objects() if type(thing) in kinds}
 
 
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("count", [30, pytest.param(2000, marks=pytest.mark.slow)])
-def test_sessions_leave_nothing_behind(model, count, record_property):
+def test_sessions_leave_nothing_behind(model, count):
     """Files, threads and memory after many sessions: connect, one picture, disconnect."""
-    warm = max(count // 10, 10)
-    others = {id(thing): thing for thing in clients()}  # of other tests
+    process, others = psutil.Process(), clients()  # of other tests
     with serving(model) as viewer:
 
-        def visit(number: int) -> None:
-            with Client(viewer, close_timeout=1.0) as client:
-                client.look(position=(0.01 * (number % 50), 0.0, -4.0))
-                assert client.picture().ndim == 3
-
-        def settled() -> dict[str, int]:
-            wait_for(lambda: not viewer.sessions and not viewer.web.gate.connections)
+        def used_after(sessions: int) -> tuple[int, int, int]:
+            for number in range(sessions):
+                with Client(viewer, close_timeout=1.0) as client:
+                    client.look(position=(0.01 * (number % 50), 0.0, -4.0))
+                    assert client.picture().ndim == 3
+            wait_for(lambda: not viewer.sessions and not viewer.gate.connections)
             gc.collect()
-            return resources()
+            files = process.num_fds() if os.name == "posix" else process.num_handles()
+            return files, process.num_threads(), process.memory_info().rss
 
-        for number in range(warm):
-            visit(number)
-        before = settled()
-        for number in range(count):
-            visit(number)
-        after: dict[str, Any] = settled()
-        record_property("sessions", {"before": before, "after": after})
-        print(f"after {warm} sessions {before}, after {count} more {after}")
+        before, after = used_after(max(count // 10, 10)), used_after(count)
         server = viewer.server._websock_server
         assert not server._client_state_from_id and not server._live_connections
-        kept = {id(thing): thing for thing in clients()}
-        assert kept.keys() <= others.keys(), "nothing refers to a client that has left"
-    assert after["files"] <= before["files"] + 2
-    assert after["threads"] <= before["threads"] + 32, "viser's pool"
-    assert after["bytes"] <= before["bytes"] + 32 * 2**20
+        assert clients().keys() <= others.keys(), "nothing refers to a client that has left"
+    growth = [new - old for new, old in zip(after, before, strict=True)]
+    assert growth[0] <= 2 and growth[1] <= 32 and growth[2] <= 32 * 2**20, "viser's pool has 32 threads"

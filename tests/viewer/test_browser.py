@@ -122,37 +122,3 @@ def test_in_a_browser(model, tmp_path, monkeypatch):
         browser.close()
         wait_for(lambda: not viewer.sessions)
     assert not errors, errors
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
-@pytest.mark.slow
-@pytest.mark.timeout(180)
-def test_a_browser_carries_the_token_from_the_page_to_the_websocket(model):
-    api = pytest.importorskip("playwright.sync_api")
-    with serving(model, host="0.0.0.0") as viewer, api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        own = viewer.url.partition("?")[0]
-        stranger = browser.new_context().new_page()
-        answer = stranger.goto(own)
-        assert answer is not None and answer.status == 403 and "needs its token" in stranger.content()
-
-        page = browser.new_context().new_page()
-        page.goto(viewer.url)
-        wait_for(lambda: len(viewer.sessions) == 1)
-        page.reload()
-        again = page.context.new_page()
-        again.goto(own)  # another tab has the cookie
-        again.get_by_text("nexwarp · nexwarp").wait_for()
-        wait_for(lambda: len(viewer.sessions) == 2)
-        assert "token" not in page.evaluate("document.cookie"), "no script reads it"
-        foreign = page.context.new_page()
-        opened = foreign.evaluate(CONNECT, viewer.url.replace("http", "ws"))
-        assert opened == "refused" and len(viewer.sessions) == 2
-        browser.close()
-
-
-CONNECT = """url => new Promise(done => {
-    const socket = new WebSocket(url, "viser-v1");
-    socket.onopen = () => done("connected");
-    socket.onerror = () => done("refused");
-})"""

@@ -11,7 +11,7 @@ import torch
 import nexwarp as nw
 from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.run.folder import keep_camera_path
-from nexwarp.viewer import panel
+from nexwarp.viewer import session as session_module
 from nexwarp.viewer import viewer as viewer_module
 from nexwarp.viewer.pacing import SMALLEST, Pace, Share
 from nexwarp.viewer.world import (
@@ -99,7 +99,7 @@ def test_what_is_no_camera_is_refused(wrong):
 
 def test_a_path_is_played_and_kept_as_its_views_say(model, tmp_path, monkeypatch) -> None:
     """Views are added and removed; what the run keeps passes through them; numbers of views and paths are bounded."""
-    monkeypatch.setattr(panel, "MOST_VIEWS", 3)
+    monkeypatch.setattr(session_module, "MOST_VIEWS", 3)
     monkeypatch.setattr(viewer_module, "MOST_PATHS", 2)
     with serving(model, save_path=lambda path: keep_camera_path(tmp_path, path)) as viewer, Client(viewer) as client:
         client.look()
@@ -112,7 +112,7 @@ def test_a_path_is_played_and_kept_as_its_views_say(model, tmp_path, monkeypatch
             view = Viewpoint.of_camera(session.cameras[name])
             session.viewpoint = view
             editor.add()
-        editor.remove()
+        editor._set_views(editor.views[:-1])
         assert len(editor.views) == 2
         editor.keep()
         kept = load_camera_path(tmp_path / "camera_path_1.json")

@@ -3,26 +3,16 @@
 import math
 import shutil
 import socket
-from typing import Any
 
 import pytest
 
-from nexwarp.cli import main as cli
-from nexwarp.viewer.modes import draw
+from tests.cli.support import refused
 from tests.viewer.support import Client, serving, wait_for
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
-def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *words: str) -> None:
-    """The command fails with one line that holds the words."""
-    assert cli.main(arguments) == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 and all(word in lines[0] for word in words), lines
-
-
-def test_one_line_for_what_cannot_be_shown(run, tmp_path, capsys, monkeypatch):
-    capsys.readouterr()
+def test_one_line_for_what_cannot_be_shown(run, tiny_folder, tmp_path, capsys, monkeypatch):
     refused(capsys, ["view", str(tmp_path / "none")], str(tmp_path / "none"), "expected a run folder")
     shutil.copytree(run, tmp_path / "early")
     (tmp_path / "early" / "model.safetensors").unlink()
@@ -31,7 +21,7 @@ def test_one_line_for_what_cannot_be_shown(run, tmp_path, capsys, monkeypatch):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         refused(capsys, ["view", str(run), "--port", port], "--port", port, "in use", "another")
-        new = ["train", str(run.parent / "tiny"), "--run", str(tmp_path / "new"), "--view", "--port", port]
+        new = ["train", str(tiny_folder), "--run", str(tmp_path / "new"), "--view", "--port", port]
         refused(capsys, new, "--port", "in use")
     assert not (tmp_path / "new").exists()
     refused(capsys, ["view", str(run), "--port", "70000"], "--port", "65535", "70000")
@@ -64,7 +54,7 @@ def test_nonsense_is_dropped_and_hurts_nobody(model, capfd):
         bad.look()
         wait_for(lambda: len(viewer.sessions) == 2)
         session = viewer.sessions[max(viewer.sessions)]
-        slider = session.panel.max_hits
+        slider = session.panel.controls["max_hits"]
         uuid = slider._impl.uuid
         wait_for(lambda: session.drawn_version == session.version)
         version = session.version
@@ -89,22 +79,3 @@ def test_nonsense_is_dropped_and_hurts_nobody(model, capfd):
         assert good.picture().ndim == 3
     out, err = capfd.readouterr()
     assert "Traceback" not in out + err, out + err
-
-
-def test_a_picture_that_fails_is_told_and_the_rest_goes_on(model, monkeypatch):
-    from nexwarp.viewer import viewer as module
-
-    def fail(*arguments: Any, **options: Any) -> Any:
-        if arguments[2].mode == "normal":
-            raise RuntimeError("out of memory")
-        return draw(*arguments, **options)
-
-    monkeypatch.setattr(module, "draw", fail)
-    with serving(model) as viewer, Client(viewer) as client:
-        client.look()
-        wait_for(lambda: len(viewer.sessions) == 1)
-        (session,) = viewer.sessions.values()
-        session.change("mode", "normal")
-        assert any("out of memory" in str(message) for message in client.hear())
-        session.change("mode", "image")
-        wait_for(lambda: session.drawn_version == session.version and session.drawn_scale == 1.0)
