@@ -106,12 +106,16 @@ def check_tensors(
     return sizes
 
 
+def check_each(name: str, good: torch.Tensor, tensor: torch.Tensor, expected: str) -> None:
+    """Raise ValueError naming the first element, or row, of `tensor` that is not good."""
+    if not bool(good.all()):
+        where = tuple(torch.nonzero(~good)[0].tolist())
+        raise ValueError(f"{name}: expected {expected}, got {tensor[where].tolist()} at index {where}")
+
+
 def check_finite(name: str, tensor: torch.Tensor) -> None:
     """Raise ValueError naming the first element of `tensor` that is NaN or infinite."""
-    bad = ~torch.isfinite(tensor)
-    if bool(bad.any()):
-        where = tuple(torch.nonzero(bad)[0].tolist())
-        raise ValueError(f"{name}: expected finite values, got {tensor[where].item()} at index {where}")
+    check_each(name, torch.isfinite(tensor), tensor, "finite values")
 
 
 def check_values(name: str, tensor: torch.Tensor, low: float, high: float) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ LARGEST_DISTANCE = 1e16  # of a camera from the origin, world units: its square 
 SMALLEST_FOCAL = 1e-16  # pixels
 
 
-@dataclass(frozen=True, init=False)
+@dataclass(frozen=True)
 class Camera:
     """A pinhole camera.
 
@@ -60,24 +60,27 @@ class Camera:
     cx: float = field(init=False)
     cy: float = field(init=False)
 
-    def __init__(
-        self,
-        viewmat: Array,
-        K: Array,
-        width: int,
-        height: int,
-        near: float = 0.01,
-        *,
-        origin: tuple[float, float, float] | None = None,
-        checked: tuple[float, float, float, float] | None = None,
-    ) -> None:
+    if TYPE_CHECKING:  # the constructor takes arrays, the fields are tensors
+
+        def __init__(
+            self,
+            viewmat: Array,
+            K: Array,
+            width: int,
+            height: int,
+            near: float = 0.01,
+            *,
+            origin: tuple[float, float, float] | None = None,
+            checked: tuple[float, float, float, float] | None = None,
+        ) -> None: ...
+
+    def __post_init__(self, checked: tuple[float, float, float, float] | None) -> None:
         if checked is None:
-            viewmat = _as_tensor("viewmat", viewmat, None)
-            K = _as_tensor("K", K, viewmat.device)
-            checked = _check(viewmat, K, {"width": width, "height": height}, near)
-        fx, fy, cx, cy = checked
-        vars(self).update(viewmat=viewmat, K=K, width=width, height=height, near=near, origin=origin)
-        vars(self).update(fx=fx, fy=fy, cx=cx, cy=cy)
+            viewmat = _as_tensor("viewmat", self.viewmat, None)
+            K = _as_tensor("K", self.K, viewmat.device)
+            vars(self).update(viewmat=viewmat, K=K)
+            checked = _check(viewmat, K, {"width": self.width, "height": self.height}, self.near)
+        vars(self).update(zip(("fx", "fy", "cx", "cy"), checked, strict=True))
 
     @property
     def focal(self) -> float:

@@ -49,14 +49,11 @@ def save_transforms(
     test: Sequence[str] | None = None,
     lenses: Mapping[str, Mapping[str, Json]] | None = None,
 ) -> None:
-    """Write cameras as a `transforms.json`; each frame has its own intrinsics, so that sizes may differ.
+    """Write cameras, by the names of their image files, as a `transforms.json`, atomically.
 
-    Args:
-        path: the file, written atomically.
-        cameras: name of the image file -> camera.
-        train: names for `train_filenames`.
-        test: names for `val_filenames` and `test_filenames`. If `train` and `test` are None, no split is written.
-        lenses: for some names, keys of a distorted lens with its `camera_model`, in place of the camera's intrinsics.
+    Each frame has its own intrinsics, so that sizes may differ. `lenses` has for some names the keys of a distorted
+    lens, with its `camera_model`, in place of the camera's intrinsics. `train` are the names for `train_filenames`,
+    `test` those for `val_filenames` and `test_filenames`; if both are None, no split is written.
 
     Raises:
         ValueError: no cameras; OSError: `path` cannot be written.
@@ -81,18 +78,12 @@ def save_transforms(
 def load_transforms(
     path: str | os.PathLike[str], near: float = 0.01, origin: tuple[float, float, float] = WORLD
 ) -> dict[str, Camera]:
-    """Read the cameras of a `transforms.json` as pinhole cameras; distortion coefficients are ignored.
+    """Read the cameras of a `transforms.json`, by the names of their images, as pinholes without distortion.
 
-    The images need not exist. Intrinsics are those of the frame, else those of the file: `fl_x`, `fl_y` or
-    `camera_angle_x`, `camera_angle_y`; `cx`, `cy` (default: the image centre); `w`, `h`.
-
-    Args:
-        path: the file.
-        near: near depth of the cameras, world units.
-        origin: world coordinates of the origin of the frame to return cameras in, such as `Model.origin`.
-
-    Returns:
-        Name of the image file -> camera, float32 on the CPU, in the order of the file.
+    They are float32 on the CPU, in the order of the file, with the near depth `near` in world units, in the frame
+    whose origin has the world coordinates `origin`, such as `Model.origin`. The images need not exist. Intrinsics are
+    those of the frame, else those of the file: `fl_x`, `fl_y` or `camera_angle_x`, `camera_angle_y`; `cx`, `cy`
+    (default: the image centre); `w`, `h`.
 
     Raises:
         FileNotFoundError: no such file. ValueError: a key is missing or has an invalid value; the message names the
@@ -103,19 +94,15 @@ def load_transforms(
 
 
 def save_camera_path(path: str | os.PathLike[str], cameras: Sequence[Camera], fps: float = 30.0) -> None:
-    """Write a camera path in nerfstudio's format, for `ns-render camera-path` and `nexwarp render --path`.
+    """Write a camera path in nerfstudio's format, for `ns-render camera-path` and `nexwarp render --path`, atomically.
 
     nerfstudio's entries hold a vertical field of view only; they imply square pixels and a centred principal point. For
     other cameras the focal lengths and principal point are added as `fl_x`, `fl_y`, `cx`, `cy`, which nexwarp reads and
     nerfstudio ignores.
 
-    Args:
-        path: the file, written atomically.
-        cameras: cameras of one size.
-        fps: frames a second.
-
     Raises:
-        ValueError: no cameras, cameras of several sizes, `fps` not > 0; OSError: `path` cannot be written.
+        ValueError: no cameras, cameras of several sizes, `fps` (frames a second) not > 0; OSError: `path` cannot be
+            written.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one, got none")
@@ -154,14 +141,7 @@ def load_camera_path(
 ) -> CameraPath:
     """Read a camera path: nerfstudio's (key `camera_path`), or the frames of a `transforms.json` in their order.
 
-    Args:
-        path: the file.
-        near: near depth of the cameras, world units.
-        origin: see `load_transforms`.
-
-    Raises:
-        FileNotFoundError: no such file. ValueError: a key is missing or has an invalid value; the message names the
-            entry and key.
+    `near` and `origin` are those of `load_transforms`, whose errors it raises, too.
     """
     path = Path(path)
     data = _read(path)

@@ -92,11 +92,11 @@ def spiral(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     return [_looking(cameras[0], place, target if share == 1.0 else place + forward, up) for place in places]
 
 
-def interpolate(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
+def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = None) -> list[Camera]:
     """Return `count` cameras on a smooth path from the first to the last of the given ones.
 
-    The path passes through key cameras: at most one for every 10 of `count`, at even spacing in the list, the first
-    and last included. The time between two keys is proportional to their distance and rotation. Centres
+    The path passes through key cameras: at most `keys` (None is one for every 10 of `count`), at even spacing in the
+    list, the first and last included. The time between two keys is proportional to their distance and rotation. Centres
     follow a cubic spline, rotations one of continuous angular acceleration. All else is that of the first camera.
 
     Raises:
@@ -106,7 +106,7 @@ def interpolate(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     from scipy.spatial.transform import Rotation, RotationSpline
 
     check_range("count", count, 1)
-    keys = max(count // FRAMES_PER_KEY, 2)
+    keys = max(count // FRAMES_PER_KEY, 2) if keys is None else keys
     viewmats, centres = camera_poses(cameras)
     if len(cameras) > keys:
         chosen = torch.linspace(0, len(cameras) - 1, keys, dtype=torch.float64).round().long()

@@ -25,6 +25,7 @@ LEAST_WEIGHT = 1.0 / 64.0
 NOWHERE = 1e30
 TINY_WEIGHT = 1e-3  # hits below it keep their plain colours
 
+SIDE = 4096  # texels of the atlas along an axis at most
 MAX_SIDE = 256  # texels of one surfel along one axis
 FILLED = 0.85  # fraction of the atlas that rectangles cover at most: packing leaves gaps
 BISECTIONS = 24
@@ -126,16 +127,6 @@ class Baked:
     layout: Layout  # the surfels' texels in the atlas
     atlas: torch.Tensor  # (height, width, 3) float32, added to the plain colours, sRGB
 
-    @torch.no_grad()
-    def render(self, camera: Camera) -> torch.Tensor:
-        """Return the image (H, W, 3) of a camera at the mean exposure.
-
-        Of each pixel, the 8 heaviest hits have their texels; further hits have their plain colours.
-        """
-        hits = hits_of(untextured(self.model, self.surfels), camera)
-        plain = hits.plain_colors()
-        return hits.rendering.image + hits.blended(torch.maximum(self.added(hits.ids, hits.local), -plain))
-
     def added(self, ids: torch.Tensor, local: torch.Tensor) -> torch.Tensor:
         """Return what the atlas adds (..., 3) to the colours of surfels (...) at coordinates (..., 2) on them."""
         return sample(self.atlas, self.layout.texels(ids, local))
@@ -224,25 +215,23 @@ def observe(model: Model, cameras: Sequence[Camera]) -> Observations:
     return Observations(boxes, pixels, textured / total.clamp_min(1e-12), normalize(directions, dim=-1))
 
 
-def lay_out(
-    boxes: torch.Tensor, pixels: torch.Tensor, *, texel: float = 1.0, side: int = 4096, fewest: int = 2
-) -> Layout:
+def lay_out(boxes: torch.Tensor, pixels: torch.Tensor, *, fewest: int = 2) -> Layout:
     """Give each surfel with a box (N, 4) of u1 > u0, in units of the scales, a rectangle.
 
-    One scale covers `pixels` (N, 2) along either axis. `texel`, the size of a texel in pixels, grows until the atlas of
-    at most `side` texels a side holds all of them. A surfel has `fewest` texels along an axis where there is room.
+    One scale covers `pixels` (N, 2) along either axis. A texel is a pixel large, or as large as the atlas needs to hold
+    all of them. A surfel has `fewest` texels along an axis where there is room.
     """
     textured = boxes[:, 2] > boxes[:, 0]
     boxes = boxes.where(textured[:, None], 0.0)
     covered = ((boxes[:, 2:] - boxes[:, :2]) * pixels)[textured].double().cpu()
-    room = FILLED * side * side
+    room = FILLED * SIDE * SIDE
     fewest = max(min(fewest, int(math.sqrt(room / max(len(covered), 1)))), 2)
 
     def sizes_at(step: float) -> tuple[torch.Tensor, int]:
         sizes = ((covered / step).ceil() + 1).clamp(fewest, MAX_SIDE).int()
         return sizes, int(sizes.long().prod(1).sum())
 
-    low = high = texel
+    low = high = 1.0  # pixels a texel
     while sizes_at(high)[1] > room and high < LARGEST_TEXEL:
         high *= 2
     for _ in range(BISECTIONS if high > low else 0):
@@ -253,12 +242,12 @@ def lay_out(
             high = middle
     while True:
         sizes, area = sizes_at(high)
-        width = min(side, max(64, 2 ** math.ceil(math.log2(math.sqrt(max(area, 1) / FILLED)))))
+        width = min(SIDE, max(64, 2 ** math.ceil(math.log2(math.sqrt(max(area, 1) / FILLED)))))
         places, height = _pack(sizes, width)
-        if height <= side and (not len(sizes) or int(sizes[:, 0].max()) <= width):
+        if height <= SIDE and (not len(sizes) or int(sizes[:, 0].max()) <= width):
             break
         if high > LARGEST_TEXEL:
-            raise ValueError(f"side: expected a larger atlas than {side} for {len(sizes):,} surfels")
+            raise FormatError(f"surfels: expected fewer for an atlas of {SIDE}x{SIDE} texels, got {len(sizes):,}")
         high *= GROWTH  # the shelves leave more gaps than FILLED allows for
     rects = torch.tensor([0, 0, 1, 1], dtype=torch.int32).repeat(len(boxes), 1)
     rects[textured.cpu()] = torch.cat([places, sizes], dim=1)

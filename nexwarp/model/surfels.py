@@ -11,7 +11,7 @@ from torch import nn
 from nexwarp import ops
 from nexwarp.cameras.camera import Array
 from nexwarp.data.ply import read_vertices
-from nexwarp.errors import FormatError, check_finite, check_tensors
+from nexwarp.errors import FormatError, check_each, check_finite, check_tensors
 from nexwarp.kernels.types import MAX_SH_DEGREE
 from nexwarp.model.bounds import check_bounds
 
@@ -120,10 +120,10 @@ class Surfels(nn.Module):
                 )
             check_finite(name, tensor)
         largest = quats.abs().amax(dim=-1, keepdim=True)
-        _check_each("quats", largest[..., 0] > 0, quats, "a length > 0")
-        _check_each("scales", scales > 0, scales, "values > 0")
-        _check_each("opacities", (opacities >= 0) & (opacities <= 1), opacities, "values in [0, 1]")
-        _check_each("gammas", gammas >= 1, gammas, "values >= 1")
+        check_each("quats", largest[..., 0] > 0, quats, "a length > 0")
+        check_each("scales", scales > 0, scales, "values > 0")
+        check_each("opacities", (opacities >= 0) & (opacities <= 1), opacities, "values in [0, 1]")
+        check_each("gammas", gammas >= 1, gammas, "values >= 1")
         raw = {
             "means": means,
             "raw_quats": nn.functional.normalize(quats / largest, dim=-1),
@@ -250,9 +250,3 @@ def check_coefficients(name: str, count: int) -> None:
         counts = f"{', '.join(map(str, most))} or {last}"
         removed = "; SH degrees above 3 were removed" if count in (25, 36, 49) else ""
         raise ValueError(f"{name}: expected {counts} spherical harmonics coefficients, got {count}{removed}")
-
-
-def _check_each(name: str, good: torch.Tensor, tensor: torch.Tensor, expected: str) -> None:
-    if not bool(good.all()):
-        where = tuple(torch.nonzero(~good)[0].tolist())
-        raise ValueError(f"{name}: expected {expected}, got {tensor[where].tolist()} at index {where}")

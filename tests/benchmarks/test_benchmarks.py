@@ -60,11 +60,11 @@ def test_table_compares_gpu_and_cpu() -> None:
 
 def test_scenes_are_seeded(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
-    points = {"means3d": generator.normal(size=(50, 3)).astype(np.float32)}
-    points |= {"colors": generator.integers(0, 256, (50, 3), dtype=np.uint8)}
-    K, viewmat = np.float32([[480.0, 0, 324], [0, 480, 210], [0, 0, 1]]), np.eye(4, dtype=np.float32)
+    K, viewmat = np.array([[480.0, 0, 324], [0, 480, 210], [0, 0, 1]], np.float32), np.eye(4, dtype=np.float32)
     viewmat[2, 3] = 3.0
-    np.savez(tmp_path / "garden_points.npz", viewmats=viewmat[None], Ks=K[None], **points)
+    means = generator.normal(size=(50, 3)).astype(np.float32)
+    colors = generator.integers(0, 256, (50, 3), dtype=np.uint8)
+    np.savez(tmp_path / "garden_points.npz", means3d=means, colors=colors, viewmats=viewmat[None], Ks=K[None])
     made = []
     for seed in (1, 2):
         torch.manual_seed(seed)  # scenes must not depend on it

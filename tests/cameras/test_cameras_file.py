@@ -28,9 +28,19 @@ def test_cameras_come_back_exactly(tmp_path):
 
 
 ROWS = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-CAMERA = {"viewmat": ROWS, "K": [[9.0, 0.0, 4.0], [0.0, 9.0, 3.0], [0.0, 0.0, 1.0]], "width": 8, "height": 6}
+CAMERA: dict[str, object] = {
+    "viewmat": ROWS,
+    "K": [[9.0, 0.0, 4.0], [0.0, 9.0, 3.0], [0.0, 0.0, 1.0]],
+    "width": 8,
+    "height": 6,
+}
 NEAR = CAMERA | {"near": 0.1}
-CHANGES = [{"near": "x"}, {"viewmat": ROWS[:3]}, {"viewmat": "text"}, {"viewmat": [[float("nan")] * 4] * 4}]
+CHANGES: list[dict[str, object]] = [
+    {"near": "x"},
+    {"viewmat": ROWS[:3]},
+    {"viewmat": "text"},
+    {"viewmat": [[float("nan")] * 4] * 4},
+]
 CHANGES += [{"K": ROWS}, {"width": 0}]
 
 

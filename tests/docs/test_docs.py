@@ -153,7 +153,7 @@ SECTION = re.compile(r"(Args|Attributes|Buffers|Returns|Yields|Raises):")
 
 def source_signature(made: Any, name: str) -> str:
     """The signature as the code has it, types included."""
-    if dataclasses.is_dataclass(made):
+    if isinstance(made, type) and dataclasses.is_dataclass(made):
         bases = [base for base in reversed(made.__mro__) if dataclasses.is_dataclass(base)]
         lines = [line for base in bases for line in definition_of(base).body if isinstance(line, ast.AnnAssign)]
         types = {ast.unparse(line.target): ast.unparse(line.annotation) for line in lines}
@@ -161,7 +161,7 @@ def source_signature(made: Any, name: str) -> str:
         return f"{name}({', '.join(fields)})"
     if isinstance(made, type) and "__init__" not in vars(made):
         return name
-    node = definition_of(made.__init__ if isinstance(made, type) else made)
+    node = definition_of(vars(made)["__init__"] if isinstance(made, type) else made)
     if node.args.args and node.args.args[0].arg in ("self", "cls"):
         node.args.args.pop(0)
     result = "" if node.returns is None or node.name == "__init__" else f" -> {ast.unparse(node.returns)}"

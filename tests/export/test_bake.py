@@ -13,7 +13,16 @@ from nexwarp.export.bake import Baked, bake, evaluate, lay_out, observe
 from nexwarp.export.glb import CUTOFF, save_glb, upright
 from nexwarp.export.splats import save_splats_spz
 from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE, encode_atlas, encode_baked, encode_harmonics
-from tests.export.web.support import as_stored, bilinear, composited, decode_atlas, decode_harmonics, psnr, ring
+from tests.export.web.support import (
+    as_stored,
+    bilinear,
+    composited,
+    decode_atlas,
+    decode_harmonics,
+    psnr,
+    rendered,
+    ring,
+)
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
@@ -56,9 +65,11 @@ def test_texels_have_one_owner_each_and_lie_where_sampling_looks_for_them(baked)
     assert_close(layout.texels(ids, local + 100.0), corners, kind="value", name="beyond")
 
 
-def test_an_atlas_that_is_too_small_has_larger_texels(model, cameras):
+def test_an_atlas_that_is_too_small_has_larger_texels(model, cameras, monkeypatch):
     seen = observe(model, list(cameras.values()))
-    large, small = (lay_out(seen.boxes, seen.pixels, texel=0.5, side=side) for side in (2048, 128))
+    large = lay_out(seen.boxes, 2 * seen.pixels)
+    monkeypatch.setattr("nexwarp.export.bake.SIDE", 128)
+    small = lay_out(seen.boxes, 2 * seen.pixels)
     assert max(small.width, small.height) <= 128 < max(large.width, large.height)
 
 
@@ -68,7 +79,7 @@ def test_the_first_atlas_has_the_colors_of_the_texture(residual, cameras):
     model = make_model(residual, count=1, sh_degree=0)
     seen = observe(model, list(cameras.values()))
     assert seen.textured[0] == 1
-    image = evaluate(model, seen, lay_out(seen.boxes, seen.pixels, texel=0.25)).render(cameras["1.png"])
+    image = rendered(evaluate(model, seen, lay_out(seen.boxes, 4 * seen.pixels)), cameras["1.png"])
     expected = model.render(cameras["1.png"]).image.detach()
     plain = model.bare(max_hits=0).render(cameras["1.png"]).image.detach()
     assert psnr(image, expected) > max(45, psnr(plain, expected) + 10)
@@ -77,11 +88,11 @@ def test_the_first_atlas_has_the_colors_of_the_texture(residual, cameras):
 def test_images_are_those_of_the_definition_and_the_fit_approaches_the_model(baked, model, cameras):
     for camera in cameras.values():
         # Hits beyond the eighth, and those below a thousandth, have their plain colours.
-        assert psnr(baked.render(camera), composited(copy.deepcopy(baked), camera)) > 50
+        assert psnr(rendered(baked, camera), composited(copy.deepcopy(baked), camera)) > 50
         expected = model.render(camera).image.detach()
-        first = evaluate(model, baked.seen, baked.layout).render(camera)
+        first = rendered(evaluate(model, baked.seen, baked.layout), camera)
         plain = model.bare(max_hits=0).render(camera).image.detach()
-        fitted = psnr(as_stored(baked).render(camera), expected)
+        fitted = psnr(rendered(as_stored(baked), camera), expected)
         assert fitted > psnr(first, expected) + 1, "the fit helps"
         assert fitted > psnr(plain, expected) + 6 and fitted > 24
 
@@ -91,8 +102,8 @@ def test_codes_are_near_the_values(baked):
     inside = baked.atlas.clamp(-scale, scale)
     assert float((decode_atlas(codes, scale) - inside).abs().max()) <= 0.51 * scale / 127
     values = baked.surfels.shN.detach().numpy()
-    codes, ranges = encode_harmonics(baked.surfels)
-    error = np.abs(decode_harmonics(codes, ranges) - values)
+    steps, ranges = encode_harmonics(baked.surfels)
+    error = np.abs(decode_harmonics(steps, ranges) - values)
     assert (error <= np.sqrt(np.abs(values) * ranges[0]) / 127 + ranges[0] / 127**2).all()
 
 
@@ -101,7 +112,7 @@ def test_a_gpu_bakes_what_the_cpu_bakes(model, baked, cameras, tmp_path):
     views = list(cameras.values())
     there = bake(copy.deepcopy(model).cuda(), views, steps=40)
     for camera in views:
-        assert psnr(as_stored(there).render(camera).cpu(), as_stored(baked).render(camera)) > 35
+        assert psnr(rendered(as_stored(there), camera).cpu(), rendered(as_stored(baked), camera)) > 35
     assert encode_baked(there, cameras).keys() == {BAKED_FILE, ATLAS_FILE}
     pytest.importorskip("trimesh")
     save_glb(tmp_path / "scene.glb", there, views)

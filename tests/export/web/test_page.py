@@ -17,7 +17,18 @@ from nexwarp.export.bake import bake
 from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE
 from nexwarp.export.web.export import page_files, static_files
 from nexwarp.export.web.scene_file import SCENE_FILE
-from tests.export.web.support import CHROMIUM, URL, WEBGPU, Tab, as_stored, entry_of, psnr, read_sections, ring
+from tests.export.web.support import (
+    CHROMIUM,
+    URL,
+    WEBGPU,
+    Tab,
+    as_stored,
+    entry_of,
+    psnr,
+    read_sections,
+    rendered,
+    ring,
+)
 from tests.scenes import make_surfels, make_texture, random_scene
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
@@ -127,7 +138,7 @@ def test_the_baked_scene_in_the_page_is_the_one_of_python(tab, model, cameras):
         drawn = tab.value(DRAW, entry_of(camera))
         image = torch.tensor(drawn[0]).reshape(camera.height, camera.width, 4)[..., :3]
         with torch.no_grad():
-            expected = (baked.render(camera) * model.exposures.factors(camera)).clamp(0, 1)
+            expected = (rendered(baked, camera) * model.exposures.factors(camera)).clamp(0, 1)
             out = model.render(camera)
         # Pixels where the near plane cuts a surfel may differ; without the plane, the picture has under 20 dB.
         assert psnr(image, expected) > (35 if camera is cut else 42)
