@@ -16,13 +16,13 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from PIL import Image
@@ -74,21 +74,22 @@ class Base:
             return ["render", run, *which, "--device", "cpu"]
         return ["export", run, "--format", chance.choice(FORMATS), "--device", "cpu"]
 
-    def mount(self, size: int) -> None:
-        """Mount an empty disk that holds the finished run and foreign files."""
-        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", self.disk], check=True)
-        shutil.copytree(self.folder / "run", self.disk / "run")
-        for name in FOREIGN:
-            (self.disk / name).parent.mkdir(parents=True, exist_ok=True)
-            (self.disk / name).write_text(f"not of nexwarp: {name}")
+    @contextmanager
+    def mounted(self) -> Iterator[None]:
+        """Mount a large disk that holds the finished run and foreign files; take it away with all that is on it."""
+        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={ROOMY}", "tmpfs", self.disk], check=True)
+        try:
+            shutil.copytree(self.folder / "run", self.disk / "run")
+            for name in FOREIGN:
+                (self.disk / name).parent.mkdir(parents=True, exist_ok=True)
+                (self.disk / name).write_text(f"not of nexwarp: {name}")
+            yield
+        finally:
+            subprocess.run(["umount", "-l", self.disk], check=True)
 
     def resize(self, size: int) -> None:
         """Change the size of the disk."""
         subprocess.run(["mount", "-o", f"remount,size={size}", self.disk], check=True)
-
-    def unmount(self) -> None:
-        """Take the disk away, with all that is on it."""
-        subprocess.run(["umount", "-l", self.disk], check=True)
 
     def used(self) -> int:
         """Return how many bytes of the disk are in use."""
@@ -96,32 +97,33 @@ class Base:
         return (status.f_blocks - status.f_bfree) * status.f_frsize
 
 
-def started(base: Base, words: list[str]) -> int:
-    """Start a command in a fork of this process, which has loaded all libraries; return its id."""
+def run(base: Base, words: list[str], kill_after: float | None = None) -> tuple[int, str]:
+    """Run a command in a fork of this process, which has loaded all libraries; return its exit code and its stderr.
+
+    It is killed after some seconds, on request; what it has left running ends with it.
+    """
     child = os.fork()
-    if child:
-        return child
-    code = 99
-    try:
-        os.setsid()
-        for number, name in ((1, "out"), (2, "err")):
-            os.dup2(os.open(base.folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
-        sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
-        torch.set_num_threads(1)
-        code = cli.main(words)
-    except SystemExit as stop:
-        code = int(stop.code or 0)
-    finally:
-        sys.stderr.flush()
-        os._exit(code)
-
-
-def ended(child: int) -> int:
-    """Wait for a process, end what it has left running, and return its exit code."""
+    if not child:
+        code = 99
+        try:
+            os.setsid()
+            for number, name in ((1, "out"), (2, "err")):
+                os.dup2(os.open(base.folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+            sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
+            torch.set_num_threads(1)
+            code = cli.main(words)
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        finally:
+            sys.stderr.flush()
+            os._exit(code)
+    if kill_after is not None:
+        time.sleep(kill_after)
+        os.kill(child, signal.SIGKILL)
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     with suppress(ProcessLookupError):
         os.killpg(child, signal.SIGKILL)
-    return code
+    return code, (base.folder / "err").read_text()
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -145,54 +147,32 @@ def whole(file: Path) -> bool:
     return True
 
 
-@dataclass(frozen=True)
-class Measured:
+class Measured(NamedTuple):
     """What a command does when nothing breaks."""
 
     seconds: float
-    space: int  # bytes, most that it has on the disk at once
+    space: int  # bytes that it leaves on the disk
     files: dict[str, bytes]
 
 
 def measured(base: Base, words: list[str]) -> Measured:
     """Run a command on a disk that is large enough."""
-    base.mount(ROOMY)
-    try:
-        before, most, over = base.used(), [0], threading.Event()
-
-        def watch() -> None:
-            while not over.wait(0.002):
-                most[0] = max(most[0], base.used() - before)
-
-        begun, child = time.perf_counter(), started(base, words)
-        thread = threading.Thread(target=watch)
-        thread.start()
-        code = ended(child)
-        over.set()
-        thread.join()
-        assert code == 0, (words, (base.folder / "err").read_text())
-        return Measured(time.perf_counter() - begun, max(most[0], BLOCK), files(base.disk))
-    finally:
-        base.unmount()
+    with base.mounted():
+        before, begun = base.used(), time.perf_counter()
+        code, error = run(base, words)
+        assert code == 0, (words, error)
+        return Measured(time.perf_counter() - begun, max(base.used() - before, BLOCK), files(base.disk))
 
 
 def faults(base: Base, words: list[str], normal: Measured, kind: str, share: float) -> Iterator[str]:
     """Break a command down; yield what is wrong then."""
-    base.mount(ROOMY)
-    try:
+    with base.mounted():
         before = files(base.disk)
         if kind == "full":
             base.resize((base.used() + int(share * normal.space)) // BLOCK * BLOCK + BLOCK)
-        child = started(base, words)
-        if kind == "kill":
-            time.sleep(share * normal.seconds)
-            os.kill(child, signal.SIGKILL)
-        code = ended(child)
-        error = (base.folder / "err").read_text()
-        if kind == "full" and not (code == 0 and not error):
-            if code != 2 or not error.startswith("nexwarp: error: ") or error.count("\n") != 1:
-                yield f"exit code {code}, stderr {error!r}"
-        if kind == "kill" and (code not in (0, -signal.SIGKILL) or error):
+        code, error = run(base, words, share * normal.seconds if kind == "kill" else None)
+        fits = code in (0, -signal.SIGKILL) and not error
+        if not fits and (code != 2 or not error.startswith("nexwarp: error: ") or error.count("\n") != 1):
             yield f"exit code {code}, stderr {error!r}"
         yield from damage(base, before, normal, killed=code < 0)
         base.resize(ROOMY)
@@ -201,17 +181,15 @@ def faults(base: Base, words: list[str], normal: Measured, kind: str, share: flo
             again.append("--resume")
         if words[0] == "process" and (base.disk / "scene").exists():
             again.append("--overwrite")
-        code = ended(started(base, again))
+        code, error = run(base, again)
         if code != 0:
-            yield f"once more: exit code {code}, {(base.folder / 'err').read_text()!r}"
+            yield f"once more: exit code {code}, {error!r}"
         yield from damage(base, before, normal, killed=True)
         now = files(base.disk)
         if missing := normal.files.keys() - now.keys() - {"run2/checkpoint.old"}:
             yield f"once more: {sorted(missing)[:3]} are missing"
         if now.get("run2/model.safetensors") != normal.files.get("run2/model.safetensors"):
             yield "once more: another model"
-    finally:
-        base.unmount()
 
 
 def damage(base: Base, before: dict[str, bytes], normal: Measured, *, killed: bool) -> Iterator[str]:
@@ -241,7 +219,8 @@ def prepared() -> Iterator[Base]:
         base.disk.mkdir()
         write_demo(base.folder / "scene", width=24, height=18, views=6, points=100)
         words = ["train", str(base.folder / "scene"), "--run", str(base.folder / "run"), *FLAGS]
-        assert ended(started(base, words)) == 0, (base.folder / "err").read_text()
+        code, error = run(base, words)
+        assert code == 0, error
         yield base
     finally:
         recipe.PRESETS["default"] = preset

@@ -1,14 +1,11 @@
 """Which ports commands open: in a network namespace of their own, scanned inside and knocked at from another one."""
 
-import ctypes
 import ipaddress
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,8 +16,6 @@ from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[2]
 ADDRESS = "10.77.91.1"  # of the namespace where commands run; the other one has .2
-CLONE_NEWNET = 0x40000000
-LISTENS = "0A"
 SMALL = ["texture.levels=2", "texture.table_size=256", "exposures=false", "smooth_sh=0", "footprints=false"]
 
 Place = tuple[str, int]  # address and port
@@ -29,7 +24,7 @@ Place = tuple[str, int]  # address and port
 @pytest.fixture(scope="module")
 def namespaces() -> Iterator[tuple[str, str]]:
     """Two network namespaces with a cable between them."""
-    if not (sys.platform == "linux" and os.geteuid() == 0 and shutil.which("ip")):
+    if not (sys.platform == "linux" and os.geteuid() == 0 and shutil.which("ss")):
         pytest.skip("network namespaces need Linux, root and iproute2")
     names = f"nxw{os.getpid()}a", f"nxw{os.getpid()}b"
     commands = [f"ip netns add {name}" for name in names]
@@ -67,37 +62,16 @@ class Command:
             time.sleep(0.02)
 
     def scan(self) -> set[Place]:
-        """Places at which something listens now."""
-        found: set[Place] = set()
-        namespace = f"/proc/{self.process.pid}/ns/net"
-        if os.readlink(namespace) == os.readlink("/proc/self/ns/net"):  # not there yet
-            return found
-        for name in ("tcp", "tcp6"):
-            for line in Path(f"/proc/{self.process.pid}/net/{name}").read_text().splitlines()[1:]:
-                _, local, _, state, *_ = line.split()
-                if state == LISTENS:
-                    digits, port = local.split(":")
-                    words = [bytes.fromhex(digits[i : i + 8])[::-1] for i in range(0, len(digits), 8)]
-                    found.add((str(ipaddress.ip_address(b"".join(words))), int(port, 16)))
-        return found
+        """Places at which something listens now in the namespace."""
+        command = ["ip", "netns", "exec", self.inside, "ss", "-Hltn"]
+        lines = subprocess.check_output(command, text=True).splitlines()
+        places = [line.split()[3].rpartition(":") for line in lines]
+        return {(address.strip("[]").replace("*", "::"), int(port)) for address, _, port in places}
 
     def admits(self, port: int) -> bool:
         """Whether a machine at the other end of the cable can connect to a port."""
-        connected = []
-
-        def knock() -> None:
-            with open(f"/run/netns/{self.outside}") as namespace:
-                assert ctypes.CDLL(None).setns(namespace.fileno(), CLONE_NEWNET) == 0
-            try:
-                socket.create_connection((ADDRESS, port), timeout=5).close()
-                connected.append(True)
-            except ConnectionRefusedError:
-                connected.append(False)
-
-        thread = threading.Thread(target=knock)  # a namespace is that of a thread
-        thread.start()
-        thread.join()
-        return connected[0]
+        knock = ["ip", "netns", "exec", self.outside, "bash", "-c", f"exec 3<>/dev/tcp/{ADDRESS}/{port}"]
+        return subprocess.run(knock, capture_output=True, timeout=5).returncode == 0
 
     def end(self) -> None:
         self.process.send_signal(signal.SIGINT)
