@@ -99,3 +99,10 @@ def assert_gradients(actual: torch.nn.Module, expected: torch.nn.Module, row: to
             torch.zeros_like(value) if value.grad is None else value.grad for value in (parameters[name], parameter)
         ]
         assert_close(*gradients, kind="gradient", name=name, precision=row)
+
+
+def rays_of(camera: nw.Camera) -> torch.Tensor:
+    """(H, W, 3) rays of a pinhole camera, of z-depth 1."""
+    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
+    x, y = x.to(camera.viewmat), y.to(camera.viewmat)
+    return torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1)

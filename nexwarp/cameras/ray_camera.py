@@ -1,4 +1,4 @@
-"""Cameras that are no pinholes: a ray for each pixel, from a fisheye lens, a panorama or a parallel projection."""
+"""Cameras that are no pinholes: a ray for each pixel, of a fisheye lens or a panorama."""
 
 import math
 from collections.abc import Sequence
@@ -18,20 +18,17 @@ INVERSE_ERROR = 1e-6  # radius, relative to the focal length, by which the inver
 
 @dataclass(frozen=True)
 class RayCamera:
-    """A camera with one ray for each pixel, for rendering; not differentiable.
+    """A camera with one ray for each pixel, all from its centre, for rendering; not differentiable.
 
-    `panorama`, `fisheye`, `orthographic` and `pinhole` make one. A hit's depth is in units of its pixel's ray: the
-    distance from the camera for panoramas and fisheye lenses, the z-depth for the others.
+    `panorama` and `fisheye` make one. Its pictures are resampled from the faces of a cube, pinhole pictures with
+    pixels of two thirds of the size. A hit's depth is in units of its pixel's ray: the distance from the camera for
+    panoramas and fisheye lenses.
 
     Attributes:
         viewmat: (4, 4) float, world to camera, a rigid motion; x right, y down, z forward.
-        rays: (H, W, 3) float, camera frame. For rays through the camera's centre, their directions, of any length; a
-            pixel whose ray is 0 sees nothing. For parallel rays, (x, y, 1): the ray starts at (x, y, 0) and goes along
-            z.
-        near: hits at a depth of at most this are ignored.
-        focal: pixels in a world unit at depth 1: f of paper Eq. 4. For parallel rays, at any depth.
-        parallel: whether all rays are parallel.
-        radial: whether surfels are blended in the order of their centres' distances, instead of z-depths.
+        rays: (H, W, 3) float, camera frame, directions of any length; a pixel whose ray is 0 sees nothing.
+        near: hits are ignored whose depth along the axis of their face is at most this.
+        focal: pixels in a world unit at depth 1: f of paper Eq. 4; at most 16,384.
 
     Raises:
         TypeError, ValueError: a type, shape, device or value does not fit; the message names the field.
@@ -41,8 +38,6 @@ class RayCamera:
     rays: torch.Tensor
     near: float
     focal: float
-    parallel: bool = False
-    radial: bool = True
 
     def __post_init__(self) -> None:
         check_tensors({"viewmat": (self.viewmat, (4, 4)), "rays": (self.rays, ("H", "W", 3))})
@@ -50,7 +45,7 @@ class RayCamera:
         for name, side in (("width", width), ("height", height)):
             check_range(name, side, 1, MAX_SIDE)
         check_range("near", self.near, 0, LARGEST_DISTANCE)
-        check_range("focal", self.focal, 1e-16, 1e16)
+        check_range("focal", self.focal, 1e-16, MAX_SIDE / 2)
         # The pose is checked as that of any camera.
         Camera(self.viewmat, torch.eye(3).to(self.viewmat), width, height, self.near)
         check_finite("rays", self.rays)
@@ -77,19 +72,12 @@ class RayCamera:
 
     @property
     def position(self) -> torch.Tensor:
-        """(3,) centre of the camera in the world frame; for parallel rays, the middle of the plane where they start."""
+        """(3,) centre of the camera in the world frame."""
         return -(self.viewmat[:3, :3] * self.viewmat[:3, 3:]).sum(0)  # not a product: see `Camera.position`
 
     def to(self, *args: Any, **kwargs: Any) -> "RayCamera":
         """Return a copy with `viewmat` and `rays` moved or converted; arguments as of `torch.Tensor.to`."""
         return replace(self, viewmat=self.viewmat.to(*args, **kwargs), rays=self.rays.to(*args, **kwargs))
-
-    @classmethod
-    def pinhole(cls, camera: Camera) -> "RayCamera":
-        """Return a pinhole camera as rays (x, y, 1); `nexwarp.model.render` renders the camera itself faster."""
-        x, y = _pixel_centers(camera.width, camera.height)
-        rays = torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1)
-        return cls(camera.viewmat.detach(), rays.to(camera.viewmat), camera.near, camera.focal, radial=False)
 
     @classmethod
     def panorama(cls, viewmat: torch.Tensor, width: int, height: int | None = None, near: float = 0.01) -> "RayCamera":
@@ -150,24 +138,6 @@ class RayCamera:
         outward = angle.sin() / radius.clamp_min(1e-300)
         rays = torch.stack([x * outward, y * outward, angle.cos()], -1) * valid[..., None]
         return cls(viewmat, rays.to(viewmat), near, checked.focal)
-
-    @classmethod
-    def orthographic(
-        cls, viewmat: torch.Tensor, width: int, height: int, pixel: float, near: float = 0.0
-    ) -> "RayCamera":
-        """Return a parallel projection along z, whose image is centred on the camera.
-
-        Args:
-            viewmat: (4, 4) world to camera.
-            width: image width in pixels.
-            height: image height in pixels.
-            pixel: side of a pixel in world units.
-            near: hits at a z-depth of at most this are ignored.
-        """
-        check_range("pixel", pixel, 1e-16, LARGEST_DISTANCE)
-        x, y = _pixel_centers(_side("width", width, 1), _side("height", height, 1))
-        rays = torch.stack([(x - width / 2) * pixel, (y - height / 2) * pixel, torch.ones_like(x)], -1)
-        return cls(viewmat, rays.to(viewmat), near, 1 / pixel, parallel=True, radial=False)
 
 
 def _side(name: str, value: int, least: int) -> int:

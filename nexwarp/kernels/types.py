@@ -95,23 +95,6 @@ def types(real: type) -> SimpleNamespace:
         gammas: wp.array(dtype=vec2)
 
     @wp.struct
-    class RaySurfels:
-        """Surfels as rays read them, see `nexwarp.ops.rays.RayRecords`; without `planes`, t is from the record's m."""
-
-        records: wp.array2d(dtype=vec4)
-        planes: wp.array(dtype=vec3)
-        normals: wp.array(dtype=vec3)
-        limits: wp.array(dtype=real)
-
-    @wp.struct
-    class Bounds:
-        """Bounds of the rays of blocks of pixels, see `nexwarp.ops.rays`."""
-
-        frames: wp.array(dtype=mat33)
-        middles: wp.array(dtype=vec2)
-        halves: wp.array(dtype=vec2)
-
-    @wp.struct
     class Polygons:
         """Tile polygons of surfels, see `tiles`."""
 
@@ -132,8 +115,6 @@ def types(real: type) -> SimpleNamespace:
         Hits=Hits,
         Surface=Surface,
         Polygons=Polygons,
-        RaySurfels=RaySurfels,
-        Bounds=Bounds,
         Parameters=Parameters,
         ALPHA_MIN=wp.constant(real(ALPHA_MIN)),
         ALPHA_MAX=wp.constant(real(ALPHA_MAX)),

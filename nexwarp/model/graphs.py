@@ -24,7 +24,6 @@ from torch import nn
 
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera, StagedCamera
-from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.machine import needed_memory
 from nexwarp.model.detail_limits import DetailLimits
@@ -89,7 +88,7 @@ class Frame:
     texture: Texture | None
     exposures: Exposures | None
     limits: DetailLimits | None
-    camera: Camera | RayCamera
+    camera: Camera
     options: RenderOptions
     background: Color
 

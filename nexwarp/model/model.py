@@ -16,7 +16,8 @@ from nexwarp.io.json_files import Json
 from nexwarp.model import graphs
 from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
-from nexwarp.model.options import Color, RenderChanges, RenderOptions
+from nexwarp.model.faces import draw_faces
+from nexwarp.model.options import Color, RenderChanges, RenderOptions, color_tensor
 from nexwarp.model.render import Rendering
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import Texture
@@ -124,6 +125,8 @@ class Model(nn.Module):
             return [self.render(item, background=background, **changes) for item in camera]
         if not isinstance(camera, (Camera, RayCamera)):
             raise TypeError(f"camera: expected a nexwarp.Camera or a sequence of them, got {type(camera).__name__}")
+        if isinstance(camera, RayCamera):
+            return self._faces(camera, background, changes)
         frame = self._frame(camera, background, changes)
         rendering = graphs.replayed(frame)
         return graphs.launched(frame) if rendering is None else rendering
@@ -153,11 +156,17 @@ class Model(nn.Module):
             image = graphs.replayed_image(frame)
             return graphs.launched(frame).image if image is None else image
 
-    def _frame(self, camera: Camera | RayCamera, background: Color | None, changes: RenderChanges) -> graphs.Frame:
+    def _faces(self, camera: RayCamera, background: Color | None, changes: RenderChanges) -> Rendering:
+        options = self.options.changed(**changes)
+        color = color_tensor(options.background if background is None else background, self.surfels.means)
+        parts = self.surfels, self.texture if options.max_hits else None, camera.to(self.device)
+        return draw_faces(*parts, options, color, self.exposures, limits=self.detail_limits)
+
+    def _frame(self, camera: Camera, background: Color | None, changes: RenderChanges) -> graphs.Frame:
         options = self.options.changed(**changes)
         texture = self.texture if options.max_hits else None
         color = options.background if background is None else background
-        if isinstance(camera, Camera) and camera.origin not in (None, self.origin) and self.origin is not None:
+        if camera.origin not in (None, self.origin) and self.origin is not None:
             camera = camera.moved(self.origin).to(self.surfels.means.dtype)
         return graphs.Frame(self.surfels, texture, self.exposures, self.detail_limits, camera, options, color)
 

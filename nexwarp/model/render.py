@@ -7,7 +7,6 @@ import torch
 
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
-from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.errors import OutOfMemoryError, check_tensors
 from nexwarp.machine import keep_freed_memory, needed_memory
 from nexwarp.model.detail_limits import DetailLimits, limited_depths
@@ -15,29 +14,21 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Color, RenderOptions, color_tensor
 from nexwarp.model.surfels import Activated, Surfels
 from nexwarp.model.texture import Hits, NeuralTexture, Texture
-from nexwarp.ops.rays import RayHits, collect_rays, intersect_rays, ray_records
 from nexwarp.ops.tiles import Order
 
 MAX_JITTER = 1000.0  # pixels
-FAR_AWAY = 1e4  # parallel rays see plain colours from this many times the scene's extent
 
 
 @dataclass(frozen=True)
-class RayIntermediates:
-    """Results of the stages for any camera, from which `Rendering` computes further buffers on request."""
+class Intermediates:
+    """Results of the stages, from which `Rendering` computes further buffers on request."""
 
     projection: ops.Projection
-    hits: ops.Hits | RayHits
+    hits: ops.Hits
     texels: torch.Tensor | None  # (H, W, K, 3) textured colours of the hits
     residual: bool  # whether these are added to the plain colours
     factors: torch.Tensor | None  # (3,) or (H, W, 3) gains and falloff of the exposure; None is the mean exposure
 
-
-@dataclass(frozen=True)
-class Intermediates(RayIntermediates):
-    """Results of the stages for a pinhole camera."""
-
-    hits: ops.Hits
     tiles: ops.Tiles
     pinhole: ops.Pinhole
     viewmat: torch.Tensor
@@ -95,7 +86,7 @@ class Rendering:
     @property
     def blended_normals(self) -> torch.Tensor:
         """(H, W, 3) sum over all hits of weight * unit normal, on the side that faces the camera; world frame."""
-        return self._differentiable_surface.blended_normals
+        return self._surface.blended_normals
 
     @cached_property
     def colors(self) -> torch.Tensor:
@@ -108,12 +99,8 @@ class Rendering:
             colors = colors * (stages.factors if stages.factors.ndim == 1 else stages.factors[:, :, None])
         return colors.masked_fill(empty, 0.0)
 
-    @property
-    def _surface(self) -> ops.Surface:
-        return self._differentiable_surface
-
     @cached_property
-    def _differentiable_surface(self) -> ops.DifferentiableSurface:
+    def _surface(self) -> ops.DifferentiableSurface:
         stages = self.intermediates
         # It is kept for later uses, so that its gradients must not depend on where the first one is.
         with torch.set_grad_enabled(stages.projection.records.requires_grad):
@@ -133,22 +120,6 @@ class Rendering:
         """Return each surfel's sum (N,) over pixels of blending weight * errors (H, W). Not differentiable."""
         stages = self.intermediates
         return ops.splat_error(stages.projection, stages.tiles, stages.hits, stages.pinhole, errors)
-
-
-@dataclass(frozen=True)
-class RayRendering(Rendering):
-    """The buffers of a rendering by a `RayCamera`; not differentiable, and without `blended_normals`.
-
-    Depths are in units of the pixels' rays: distances for panoramas and fisheye lenses, else z-depths; world units.
-    `alpha` is 0 where a pixel has no ray.
-    """
-
-    intermediates: RayIntermediates  # type: ignore[assignment]  # without those of an image plane
-
-    @property
-    def _surface(self) -> ops.Surface:
-        assert isinstance(self.intermediates.hits, RayHits)
-        return self.intermediates.hits.surface
 
 
 def render(
@@ -201,7 +172,7 @@ def render(
 def draw(
     surfels: Surfels,
     texture: Texture | None,
-    camera: Camera | RayCamera,
+    camera: Camera,
     options: RenderOptions,
     *,
     background: Color | None = None,
@@ -211,28 +182,23 @@ def draw(
 ) -> Rendering:
     """Draw surfels from a camera: the one path from the parts of a model to pixels.
 
-    As `render`, for a `RayCamera` too, which is not differentiable. Panoramas and fisheye lenses blend by distance and
-    parallel rays by z-depth, whatever the options' order. A background of None is that of the options. `jitter`:
-    (H, W, K) factors on the depths at which the texture is evaluated, see `jitter_factors`; for training.
+    As `render`. A background of None is that of the options. `jitter`: (H, W, K) factors on the depths at which the
+    texture is evaluated, see `jitter_factors`; for training.
     """
     prepare_device("surfels", surfels.means)
     exposures = exposures if options.exposure == "photos" else None
     limits = limits if options.detail_limits and len(surfels) else None
-    differentiable = torch.is_grad_enabled() and isinstance(camera, Camera)
     try:
-        with torch.autocast(surfels.device.type, enabled=False), torch.set_grad_enabled(differentiable):
+        with torch.autocast(surfels.device.type, enabled=False):
             color = color_tensor(options.background if background is None else background, surfels.means)
             _check(surfels, texture, camera, options, color, limits, jitter)
             shape = antialiased(surfels.activated(), camera, limits)
-            eye = _eye(shape.means, camera)
-            colors = ops.plain_colors((surfels.sh0, surfels.shN), shape.means, eye, options.sh_degree)
+            harmonics = surfels.sh0, surfels.shN
+            colors = ops.plain_colors(harmonics, shape.means, camera.position, options.sh_degree)
             projection = ops.project(*shape, colors, camera.viewmat)
-            if isinstance(camera, RayCamera):
-                hits: ops.Hits | RayHits = _ray_hits(shape, projection, camera, options)
-            else:
-                pinhole = pinhole_of(camera, shape.means)
-                tiles = ops.intersect_tiles(shape, projection, camera.viewmat, pinhole, blending=options.order)
-                hits = ops.collect(projection, tiles, pinhole, max_hits=options.max_hits)
+            pinhole = pinhole_of(camera, shape.means)
+            tiles = ops.intersect_tiles(shape, projection, camera.viewmat, pinhole, blending=options.order)
+            hits = ops.collect(projection, tiles, pinhole, max_hits=options.max_hits)
             texels = None if texture is None else _texels(texture, camera, hits, options, limits, jitter)
             residual = texture is not None and texture.residual
             slots = (hits.plain.new_empty(*hits.alpha.shape, 0, 3), hits.weights[..., :0])  # none are textured
@@ -242,8 +208,6 @@ def draw(
             factors = None if exposures is None else exposures.factors(camera).to(image)
             image, plain, textured = (x if factors is None else x * factors for x in (image, hits.plain, textured))
             buffers = (image, plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha)
-            if isinstance(hits, RayHits):
-                return RayRendering(*buffers, RayIntermediates(projection, hits, texels, residual, factors))
             stages = Intermediates(projection, hits, texels, residual, factors, tiles, pinhole, camera.viewmat)
             return Rendering(*buffers, stages)
     except (MemoryError, RuntimeError) as error:
@@ -253,7 +217,7 @@ def draw(
     raise memory_error(needed, camera, options.max_hits)
 
 
-def memory_error(needed: str, camera: Camera | RayCamera, max_hits: int) -> OutOfMemoryError:
+def memory_error(needed: str, camera: Camera, max_hits: int) -> OutOfMemoryError:
     """Return the error of a rendering that lacked memory, of which it needed so much."""
     return OutOfMemoryError.of(f"an image of {camera.width}x{camera.height} pixels with K = {max_hits}", needed)
 
@@ -274,7 +238,7 @@ def prepare_device(name: str, means: torch.Tensor) -> None:
 def _check(
     surfels: Surfels,
     texture: Texture | None,
-    camera: Camera | RayCamera,
+    camera: Camera,
     options: RenderOptions,
     background: torch.Tensor,
     limits: DetailLimits | None,
@@ -286,8 +250,6 @@ def _check(
         raise ValueError("clamp_texture: expected False with a residual texture, got True")
     check_camera(camera, surfels.means)
     expected: dict[str, tuple[torch.Tensor, tuple[int, ...]]] = {"background": (background, (3,))}
-    if isinstance(camera, RayCamera):
-        expected["camera.rays"] = (camera.rays, (camera.height, camera.width, 3))
     if isinstance(texture, NeuralTexture):
         expected["texture.grid"] = (texture.grid, tuple(texture.grid.shape))
     if jitter is not None:
@@ -300,43 +262,23 @@ def _check(
     ops.check_image(camera.width, camera.height, options.max_hits, dtype, device, texture=stored)
 
 
-def check_camera(camera: Camera | RayCamera, like: torch.Tensor) -> None:
+def check_camera(camera: Camera, like: torch.Tensor) -> None:
     """Check a camera's tensors: intrinsics may have any dtype, but no gradient."""
     check_tensors({"camera.viewmat": (camera.viewmat, (4, 4))}, dtype=like.dtype, device=like.device)
-    if isinstance(camera, RayCamera):
-        return
     if camera.K.device != like.device:
         raise ValueError(f"camera.K: expected a tensor on {like.device}, got one on {camera.K.device}")
     if camera.K.requires_grad and torch.is_grad_enabled():
         raise ValueError("camera.K: expected requires_grad=False: renderings have no gradient of the intrinsics")
 
 
-def antialiased(shape: Activated, camera: Camera | RayCamera, limits: DetailLimits | None) -> Activated:
+def antialiased(shape: Activated, camera: Camera, limits: DetailLimits | None) -> Activated:
     """Blur surfels that are farther away than in any training view; differentiable in the geometry and the viewmat."""
     if limits is None:
         return shape
-    depths, focal = _depths(shape.means, camera), camera.pixel_focal
+    row = camera.viewmat[2].to(shape.means)
+    depths, focal = (shape.means * row[:3]).sum(-1) + row[3], camera.pixel_focal
     blurred = ops.antialias(depths, shape.scales, shape.opacities, shape.gammas, limits.farthest, focal)
     return Activated(shape.means, shape.quats, *blurred)
-
-
-def _depths(means: torch.Tensor, camera: Camera | RayCamera) -> torch.Tensor:
-    """Return the depths (N,) of the surfels' centres: z-depths; along rays from a point, distances; 1 if parallel."""
-    if isinstance(camera, RayCamera) and camera.radial:
-        return (means - camera.position).norm(dim=-1)
-    if isinstance(camera, RayCamera) and camera.parallel:
-        return torch.ones_like(means[:, 0])
-    row = camera.viewmat[2].to(means)
-    return (means * row[:3]).sum(-1) + row[3]
-
-
-def _eye(means: torch.Tensor, camera: Camera | RayCamera) -> torch.Tensor:
-    """Return the point (3,) from which plain colours are seen; parallel rays see them from far away."""
-    position = camera.position
-    if isinstance(camera, Camera) or not camera.parallel or not len(means):
-        return position
-    extent = (means - position).norm(dim=-1).max().clamp_min(1e-12)
-    return position - FAR_AWAY * extent * camera.viewmat[2, :3]
 
 
 def pinhole_of(camera: Camera, like: torch.Tensor) -> ops.Pinhole:
@@ -344,63 +286,25 @@ def pinhole_of(camera: Camera, like: torch.Tensor) -> ops.Pinhole:
     return ops.Pinhole(camera.K.to(like), camera.width, camera.height, camera.near)
 
 
-def _ray_hits(shape: Activated, projection: ops.Projection, camera: RayCamera, options: RenderOptions) -> RayHits:
-    """Collect the hits along any rays."""
-    if camera.radial:
-        keys = _depths(shape.means, camera)
-    elif options.order == "distance" and not camera.parallel:
-        keys = projection.centers.norm(dim=-1)
-    else:
-        keys = projection.centers[:, 2]
-    records = ray_records(projection, _axes(shape, camera.viewmat) if camera.parallel else None)
-    tiles = intersect_rays(records, keys, camera.rays)
-    rays, near, viewmat = camera.rays, camera.near, camera.viewmat
-    return collect_rays(records, projection.limits, tiles, rays, near, viewmat, max_hits=options.max_hits)
-
-
-def _axes(shape: Activated, viewmat: torch.Tensor) -> torch.Tensor:
-    """Return (N, 2, 3): the surfels' axes v1 / s2 and v2 / s1 in the camera frame."""
-    w, x, y, z = shape.quats.unbind(-1)
-    first = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1)
-    second = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], -1)
-    axes = torch.stack([first / shape.scales[:, 1:], second / shape.scales[:, :1]], 1)
-    return axes @ viewmat[:3, :3].T
-
-
 def _texels(
     texture: Texture,
-    camera: Camera | RayCamera,
-    hits: ops.Hits | RayHits,
+    camera: Camera,
+    hits: ops.Hits,
     options: RenderOptions,
     limits: DetailLimits | None,
     jitter: torch.Tensor | None,
 ) -> torch.Tensor:
     """Return the textured colours (H, W, K, 3) of the hits."""
     shifted = hits.depths if jitter is None else hits.depths * jitter
-    if isinstance(camera, RayCamera):
-        positions, directions = _unproject_rays(shifted, camera)
-    else:
-        positions, directions = ops.unproject(shifted, camera.viewmat, pinhole_of(camera, shifted))
+    positions, directions = ops.unproject(shifted, camera.viewmat, pinhole_of(camera, shifted))
     found = Hits(hits.ids, hits.depths, hits.weights, hits.plain, hits.alpha, positions, directions)
     if not isinstance(texture, NeuralTexture):
-        colors = texture.colors(found, camera)  # type: ignore[arg-type]  # panoramas and the like, too
+        colors = texture.colors(found, camera)
         expected = {"texture.colors": (colors, tuple(positions.shape))}
         check_tensors(expected, dtype=positions.dtype, device=positions.device)
         return (colors.clamp_min(0) if options.clamp_texture else colors).contiguous()
-    depths = hits.depths
-    if isinstance(camera, RayCamera) and camera.parallel:  # empty slots keep 0, which the texture passes over
-        depths = (hits.weights > 0).to(hits.depths)
-    found = replace(found, depths=limited_depths(hits.ids, depths, limits, camera.focal))
+    found = replace(found, depths=limited_depths(hits.ids, hits.depths, limits, camera.focal))
     return texture.colors(found, camera, sh_degree=options.sh_degree, clamp=options.clamp_texture)
-
-
-def _unproject_rays(depths: torch.Tensor, camera: RayCamera) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the hits' points (H, W, K, 3) and the rays' unit directions (H, W, 3), world frame."""
-    rotation, shift, rays = camera.viewmat[:3, :3], camera.viewmat[:3, 3], camera.rays
-    along = torch.tensor([0.0, 0.0, 1.0]).to(rays).expand_as(rays) if camera.parallel else rays
-    start = rays * rays.new_tensor([1.0, 1.0, 0.0]) if camera.parallel else torch.zeros_like(rays)
-    points = start[:, :, None] + depths[..., None] * along[:, :, None]
-    return (points - shift) @ rotation, torch.nn.functional.normalize(along @ rotation, dim=-1)
 
 
 def jitter_factors(

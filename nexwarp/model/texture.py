@@ -12,7 +12,6 @@ from typing_extensions import Unpack
 
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
-from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.errors import check_range, check_tensors
 from nexwarp.kernels.types import MAX_SH_DEGREE
 from nexwarp.ops import fused_texture
@@ -281,9 +280,7 @@ class NeuralTexture(Texture):
         out = self._evaluate(positions.reshape(-1, 3), depths.reshape(-1), focal, self.sh_degree)
         return out.T.reshape(*depths.shape, (self.sh_degree + 1) ** 2, 3)
 
-    def colors(
-        self, hits: Hits, camera: Camera | RayCamera, *, sh_degree: int = 3, clamp: bool = False
-    ) -> torch.Tensor:
+    def colors(self, hits: Hits, camera: Camera, *, sh_degree: int = 3, clamp: bool = False) -> torch.Tensor:
         """Return the colours (H, W, K, 3) of hits; see `evaluate`. A subclass takes both keywords, too."""
         return self.evaluate(hits.points, hits.depths, hits.directions, camera.focal, sh_degree=sh_degree, clamp=clamp)
 

@@ -70,7 +70,8 @@ TRAIN = "train"
 TEST = "test"
 COMPARE = "compare"
 FILE_PATH = "path_{}"  # folder of the frames of a path from a file
-PROJECTIONS = ("panorama", "fisheye", "orthographic")  # folders of the pictures of other cameras than pinholes
+# Folders of the pictures of other cameras than pinholes; 0.2 had orthographic ones.
+PROJECTIONS = ("panorama", "fisheye", "orthographic")
 
 FOLDERS = (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER, TEACHERS_FOLDER, RENDERS_FOLDER)
 _ASIDE = r"\.checkpoint\.[^/]*\.tmp"  # a checkpoint that is being written

@@ -24,7 +24,7 @@ from nexwarp.model.buffers import render_buffers, save_buffers
 from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.ops.tiles import Order
-from nexwarp.run.folder import FILE_PATH, PROJECTIONS, RENDERS_FOLDER, TEST, TRAIN, picture_name
+from nexwarp.run.folder import FILE_PATH, RENDERS_FOLDER, TEST, TRAIN, picture_name
 from nexwarp.run.opened import OpenedModel, near_depth
 
 FRAMES = 120
@@ -67,7 +67,7 @@ class RenderOrder:
     scale: Annotated[float, arg(metavar="FACTOR")] = 1.0
     """Factor on the size of the photos, instead of --size."""
     camera: Annotated[str, arg(metavar="NAME")] = PINHOLE
-    """pinhole, panorama, fisheye or orthographic (docs/cameras.md)."""
+    """pinhole, panorama or fisheye (docs/cameras.md)."""
     fov: Annotated[float, arg(metavar="DEGREES")] = 180.0
     """Angle that the smaller side of a fisheye image shows."""
     exposure: Annotated[str | None, arg(metavar="{photos,mean}", help_behavior_hint="(default: that of the model)")] = (
@@ -81,7 +81,7 @@ class RenderOrder:
 
     def check(self) -> None:
         """Raise SettingError unless the options fit together."""
-        kinds = (PINHOLE, *PROJECTIONS)
+        kinds = (PINHOLE, "panorama", "fisheye")
         checks = [
             (self.set not in SETS, f"--set: expected test, train or all, got {self.set!r}"),
             (
@@ -250,7 +250,7 @@ class RenderJob:
                     save_buffers(picture.file.with_suffix(".exr"), buffers)
                     image = buffers.image
                 else:
-                    image = model.render(projected(self.order, model, picture.camera), **changes).image
+                    image = model.render(projected(self.order, picture.camera), **changes).image
                 pixels = to_uint8(image).cpu()
                 save_png(picture.file, pixels)
                 if append is not None and picture.is_frame:
@@ -260,11 +260,8 @@ class RenderJob:
             _remove_frames(frames[0].file.parent, len(frames))
 
 
-def projected(order: RenderOrder, model: Model, camera: Camera) -> Camera | RayCamera:
-    """Return the camera of an order's projection, at the pose of a pinhole of the picture's size.
-
-    An orthographic view shows what is at the median depth as large as the pinhole does.
-    """
+def projected(order: RenderOrder, camera: Camera) -> Camera | RayCamera:
+    """Return the camera of an order's projection, at the pose of a pinhole of the picture's size."""
     viewmat = camera.viewmat.float()
     size = (camera.width, camera.height)
     if order.camera == "panorama":
@@ -273,11 +270,6 @@ def projected(order: RenderOrder, model: Model, camera: Camera) -> Camera | RayC
         focal = min(size) / math.radians(order.fov)
         K = torch.tensor([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
         return RayCamera.fisheye(viewmat, K.to(viewmat), (0, 0, 0, 0), *size, near=camera.near)
-    if order.camera == "orthographic":
-        depths = model.render(camera).median_depth
-        hit = depths[depths > 0]
-        depth = hit.median().item() if len(hit) else float(cast(float, model.meta.get("scene_scale", 1.0)))
-        return RayCamera.orthographic(viewmat, *size, depth / camera.focal, near=camera.near)
     return camera
 
 

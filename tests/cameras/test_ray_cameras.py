@@ -1,79 +1,20 @@
-"""Cameras of rays: what they render is what pinholes render, and no surfel is lost."""
+"""Cameras of rays: their pictures are those of pinholes in all directions."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.model import render as module
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
-from nexwarp.native.warp import tile_size_on
-from nexwarp.ops.rays import RayTiles
 from nexwarp.run.evaluate import psnr
 from tests import scenes
-from tests.panorama_support import places, turned
-from tests.tolerances import FLIPS, assert_close, assert_same_ids
+from tests.render_support import rays_of
+from tests.tolerances import assert_close
 
-BUFFERS = ("image", "plain", "textured", "depths", "weights", "alpha")
-SURFACE = ("expected_depth", "median_depth", "top_depth", "normals")
-
-
-def make_model(scene, max_hits=2, textured=True):
-    surfels = scenes.make_surfels(scene)
-    texture = None
-    if textured:
-        texture = scenes.make_texture(dtype=surfels.means.dtype, device=surfels.device)
-    options = RenderOptions(max_hits=max_hits, background=(0.2, 0.4, 0.6))
-    return Model(surfels, texture, options=options)
-
-
-@pytest.mark.parametrize("max_hits", [0, 2, 8])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_pinhole_given_as_rays_is_the_pinhole(device, seed, max_hits):
-    scene = scenes.random_scene(60, seed=seed, width=67, height=45, device=device)
-    model, camera = make_model(scene, max_hits), scenes.make_camera(scene)
-    with torch.no_grad():
-        expected, actual = model.render(camera), model.render(nw.RayCamera.pinhole(camera))
-    assert_same_ids(actual.ids, expected.ids, name="ids", allow_flips=FLIPS)
-    for name in (*BUFFERS, *SURFACE):
-        if getattr(expected, name).numel():
-            assert_close(getattr(actual, name), getattr(expected, name), kind="value", name=name, allow_flips=FLIPS)
-
-
-def everywhere(surfels, keys, rays):
-    """Lists that cull nothing."""
-    order = torch.sort(keys.float(), stable=True).indices.int()
-    side = tile_size_on(rays.is_cuda)
-    columns, rows = -(-rays.shape[1] // side), -(-rays.shape[0] // side)
-    offsets = torch.arange(columns * rows + 1, device=rays.device) * len(order)
-    return RayTiles(order.repeat(columns * rows), offsets, columns)
-
-
-def cameras_of(viewmat, width=150, height=90):
-    K = torch.tensor([[40.0, 0, 70], [0, 41, 44], [0, 0, 1]]).to(viewmat)
-    return {
-        "panorama": nw.RayCamera.panorama(viewmat, width, height),
-        "tiny panorama": nw.RayCamera.panorama(viewmat, 20),
-        "fisheye": nw.RayCamera.fisheye(viewmat, K, (-0.02, 0.003, 0.0, 0.0), width, height),
-        "orthographic": nw.RayCamera.orthographic(viewmat, width, height, 0.05),
-    }
-
-
-@pytest.mark.parametrize("kind", ["panorama", "tiny panorama", "fisheye", "orthographic"])
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_lists_lose_no_surfel(device, kind, seed, monkeypatch):
-    scene = scenes.random_scene(200, seed=seed, device=device)
-    scene["means"] = scene["means"] * torch.tensor([1.0, 1.0, 2.0], device=device) - scene["means"].mean(0)
-    model = make_model(scene, textured=False)
-    camera = cameras_of(scene["viewmat"])[kind]
-    culled = model.render(camera)
-    assert culled.alpha.mean() > 0.05
-    monkeypatch.setattr(module, "intersect_rays", everywhere)
-    whole = model.render(camera)
-    for name in ("ids", *BUFFERS, *SURFACE):
-        assert torch.equal(getattr(culled, name), getattr(whole, name)), name
+BACKGROUND = (0.2, 0.4, 0.6)
 
 
 def crowd():
@@ -84,27 +25,54 @@ def crowd():
     quats, scales = torch.randn(400, 4, generator=generator), 0.4 + 0.1 * torch.rand(400, 2, generator=generator)
     sh = 0.5 * torch.randn(400, 4, 3, generator=generator)
     surfels = nw.Surfels.from_activated(means, quats, scales, 0.95 * torch.ones(400), torch.ones(400, 2), sh)
-    return Model(surfels, None, options=RenderOptions(max_hits=2))
+    return Model(surfels, None, options=RenderOptions(max_hits=2, background=BACKGROUND))
 
 
 VIEWMAT = scenes.rigid((0.9, 0.1, 0.2, -0.1), (0.1, -0.2, 0.1)).float()
 
 
-def test_crops_of_a_panorama_are_pinhole_views():
-    """Each pixel of a pinhole view by distance, looked up in a fine panorama."""
+@pytest.mark.parametrize(("yaw", "pitch"), [(0.0, 0.0), (0.8, 0.3), (3.1, -0.6), (0.3, 1.4)])
+def test_rays_of_a_pinhole_turned_anywhere_show_its_picture(device, yaw, pitch):
+    """Across the borders of faces, too: blended by distance, and depths in units of the rays."""
+    model = crowd().to(device)
+    c, s, d, e = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+    turn = torch.tensor([[c, 0, -s], [s * e, d, c * e], [s * d, -e, c * d]])
+    view = VIEWMAT.clone()
+    view[:3] = turn @ VIEWMAT[:3]
+    camera = nw.Camera(view, torch.tensor([[90.0, 0, 48], [0, 90.0, 40], [0, 0, 1]]), 96, 80).to(device)
+    rays = nw.RayCamera(VIEWMAT, rays_of(camera) @ turn, camera.near, camera.focal).to(device)
+    out, expected = model.render(rays), model.render(camera, order="distance")
+    for name in ("image", "plain", "textured", "alpha"):
+        assert (getattr(out, name) - getattr(expected, name)).square().mean().sqrt() < 0.02, name
+    for name in ("weights", "depths", "expected_depth", "median_depth", "top_depth", "normals"):
+        error = (getattr(out, name) - getattr(expected, name)).abs()
+        assert error.median() < 0.01 and error.mean() < 0.08, name
+    assert (out.ids == expected.ids).double().mean() > 0.93
+    assert not out.image.requires_grad
+
+
+def test_panoramas_show_all_around_and_faces_meet():
+    """Turned by a quarter, the same picture a quarter farther; mirrored faces would differ at their borders."""
+    model, quarter = crowd(), torch.tensor([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]])
+    turned = VIEWMAT.clone()
+    turned[:3] = quarter @ VIEWMAT[:3]
+    first, second = (model.render(nw.RayCamera.panorama(x, 256)) for x in (VIEWMAT, turned))
+    assert_close(second.image, first.image.roll(-64, 1), kind="value", name="image", allow_flips=0.01)
+    fine = model.render(nw.RayCamera.panorama(VIEWMAT, 1024)).image
+    halved = torch.nn.functional.avg_pool2d(fine.permute(2, 0, 1), 4).permute(1, 2, 0)
+    assert psnr(halved.clamp(0, 1), first.image.clamp(0, 1)) > 30
+
+
+def test_pixels_without_a_ray_show_the_background():
+    camera = nw.RayCamera.fisheye(VIEWMAT, torch.tensor([[11.0, 0, 32], [0, 11, 32], [0, 0, 1]]), (0,) * 4, 64, 64)
     model = crowd()
-    wide = model.render(nw.RayCamera.panorama(VIEWMAT, 1024)).image
-    K = torch.tensor([[40.0, 0, 24], [0, 40.0, 20], [0, 0, 1]])
-    for yaw, pitch in ((0.0, 0.0), (1.2, 0.3), (3.1, -0.6), (0.3, 1.4)):
-        view = turned(VIEWMAT, yaw, pitch)
-        camera = nw.Camera(view, K, 48, 40)
-        rays = nw.RayCamera.pinhole(camera)
-        expected = model.render(camera, order="distance").image
-        x, y = places(rays.rays @ view[:3, :3] @ VIEWMAT[:3, :3].T, 1024)
-        around = torch.cat([wide[:, -1:], wide, wide[:, :1]], 1).permute(2, 0, 1)[None]
-        place = torch.stack([(x + 1) / 1026, y / 512], -1)[None] * 2 - 1
-        sample = torch.nn.functional.grid_sample(around, place, padding_mode="border", align_corners=False)
-        assert psnr(sample[0].permute(1, 2, 0).clamp(0, 1), expected.clamp(0, 1)) > 40, (yaw, pitch)
+    blind = camera.rays.norm(dim=-1) == 0
+    assert 0.05 < blind.double().mean() < 0.5
+    for rays in (camera, dataclasses.replace(camera, rays=torch.zeros(4, 5, 3))):
+        out, empty = model.render(rays), rays.rays.norm(dim=-1) == 0
+        assert_close(out.image[empty], torch.tensor(BACKGROUND).expand(int(empty.sum()), 3), kind="value", name="image")
+        assert (out.alpha[empty] == 0).all() and (out.ids[empty] == -1).all() and (out.depths[empty] == 0).all()
+        assert (out.normals[empty] == 0).all()
 
 
 def test_a_fisheye_inverts_its_lens():
@@ -123,22 +91,6 @@ def test_a_fisheye_inverts_its_lens():
     assert (y - (torch.arange(48, dtype=torch.float64) + 0.5)[:, None])[seen].abs().max() < 1e-4
 
 
-def test_an_orthographic_view_is_a_pinhole_far_away():
-    scene = scenes.random_scene(60, width=64, height=48, dtype=torch.float64)
-    model = make_model(scene)
-    far, pixel = 3e4, 0.1
-    viewmat = scene["viewmat"]
-    camera = nw.RayCamera.orthographic(viewmat, 64, 48, pixel)
-    back = viewmat.clone()
-    back[2, 3] += far
-    K = torch.tensor([[far / pixel, 0, 32], [0, far / pixel, 24], [0, 0, 1]], dtype=torch.float64)
-    with torch.no_grad():
-        actual, expected = model.render(camera), model.render(nw.Camera(back, K, 64, 48, near=far))
-    assert actual.alpha.mean() > 0.05
-    assert psnr(actual.image.clamp(0, 1), expected.image.clamp(0, 1)) > 50
-    assert (actual.median_depth - (expected.median_depth - far))[actual.alpha > 0.6].abs().median() < 1e-3
-
-
 @pytest.mark.parametrize(
     ("make", "match"),
     [
@@ -147,7 +99,7 @@ def test_an_orthographic_view_is_a_pinhole_far_away():
         (lambda v: nw.RayCamera.panorama(2 * v, 8), "viewmat: expected"),
         (lambda v: nw.RayCamera.fisheye(v, torch.eye(3), (0, 0), 8, 8), "distortion: expected k1"),
         (lambda v: nw.RayCamera.fisheye(v, torch.eye(3), (0, 0, 0, math.nan), 8, 8), "distortion: expected"),
-        (lambda v: nw.RayCamera.orthographic(v, 8, 8, 0.0), "pixel: expected"),
+        (lambda v: nw.RayCamera(v, torch.zeros(2, 2, 3), 0.1, 1e9), "focal: expected"),
         (lambda v: nw.RayCamera(v, torch.full((2, 2, 3), math.inf), 0.1, 1.0), "rays: expected finite"),
         (lambda v: nw.RayCamera(v, torch.zeros(2, 3), 0.1, 1.0), "rays: expected shape"),
     ],

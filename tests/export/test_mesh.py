@@ -10,6 +10,7 @@ from nexwarp.errors import RunError, SettingError
 from nexwarp.export.mesh import Mesh, _surface, _without_crumbs, extract_mesh, save_mesh
 from nexwarp.ops.tsdf import DistanceField
 from tests import scenes
+from tests.render_support import rays_of
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -29,7 +30,7 @@ def cameras_around(device: torch.device) -> list[nw.Camera]:
 
 def sphere_depths(camera: nw.Camera) -> torch.Tensor:
     """Exact z-depths of a sphere around the origin, 0 beside it."""
-    rays = nw.RayCamera.pinhole(camera).rays.double()
+    rays = rays_of(camera).double()
     center = camera.viewmat[:3, 3].double()
     a, b = (rays * rays).sum(-1), rays @ center
     square = b * b - a * (center @ center - RADIUS**2)
