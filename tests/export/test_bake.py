@@ -13,16 +13,8 @@ from nexwarp.export.bake import Baked, bake, evaluate, lay_out, observe
 from nexwarp.export.glb import CUTOFF, save_glb, upright
 from nexwarp.export.splats import save_splats_spz
 from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE, encode_atlas, encode_baked, encode_harmonics
-from tests.export.web.support import (
-    as_stored,
-    bilinear,
-    composited,
-    decode_atlas,
-    decode_harmonics,
-    psnr,
-    rendered,
-    ring,
-)
+from tests.export.web import support
+from tests.export.web.support import as_stored, psnr, rendered, ring
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
@@ -88,7 +80,7 @@ def test_the_first_atlas_has_the_colors_of_the_texture(residual, cameras):
 def test_images_are_those_of_the_definition_and_the_fit_approaches_the_model(baked, model, cameras):
     for camera in cameras.values():
         # Hits beyond the eighth, and those below a thousandth, have their plain colours.
-        assert psnr(rendered(baked, camera), composited(copy.deepcopy(baked), camera)) > 50
+        assert psnr(rendered(baked, camera), support.composited(copy.deepcopy(baked), camera)) > 50
         expected = model.render(camera).image.detach()
         first = rendered(evaluate(model, baked.seen, baked.layout), camera)
         plain = model.bare(max_hits=0).render(camera).image.detach()
@@ -100,10 +92,10 @@ def test_images_are_those_of_the_definition_and_the_fit_approaches_the_model(bak
 def test_codes_are_near_the_values(baked):
     codes, scale = encode_atlas(baked.atlas)
     inside = baked.atlas.clamp(-scale, scale)
-    assert float((decode_atlas(codes, scale) - inside).abs().max()) <= 0.51 * scale / 127
+    assert float((support.decode_atlas(codes, scale) - inside).abs().max()) <= 0.51 * scale / 127
     values = baked.surfels.shN.detach().numpy()
     steps, ranges = encode_harmonics(baked.surfels)
-    error = np.abs(decode_harmonics(steps, ranges) - values)
+    error = np.abs(support.decode_harmonics(steps, ranges) - values)
     assert (error <= np.sqrt(np.abs(values) * ranges[0]) / 127 + ranges[0] / 127**2).all()
 
 
@@ -135,7 +127,7 @@ def test_the_gltf_file_holds_the_surfels(baked, cameras, tmp_path):
     image = np.asarray(mesh.visual.material.baseColorTexture).astype(float) / 255
     middle = mesh.visual.uv.reshape(-1, 4, 2).mean(1)
     places = np.stack([middle[:, 0] * image.shape[1], (1 - middle[:, 1]) * image.shape[0]], 1) - 0.5
-    found = bilinear(torch.from_numpy(image), torch.from_numpy(places)).numpy()
+    found = support.bilinear(torch.from_numpy(image), torch.from_numpy(places)).numpy()
     colors = baked.mean_colors()[visible] + baked.added(visible, torch.zeros(len(visible), 2))
     assert np.abs(found[:, :3] - colors.clamp(0, 1).detach().numpy()).mean() < 0.05
     assert np.abs(found[:, 3] - surfels.opacities[visible].detach().numpy()).max() < 0.05

@@ -7,7 +7,7 @@ from PIL import Image
 
 import nexwarp as nw
 from nexwarp.errors import FormatError, SettingError
-from nexwarp.export.web.scene_file import SceneData
+from nexwarp.export.web.scene_file import scene_arrays
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model import graphs as frames
 from nexwarp.ops.tiles import Order
@@ -68,7 +68,7 @@ def test_the_order_is_kept_in_files_and_named_where_it_is_bad(tmp_path):
     with pytest.raises(ValueError, match="order: expected depth or distance, got 1"):
         nw.render(model.surfels, None, scenes.make_camera(scene), order=1)  # type: ignore[arg-type]
     with pytest.raises(FormatError, match="order: expected depth, which the web page draws, got distance"):
-        SceneData.of(model)
+        scene_arrays(model)
 
 
 def test_the_command_renders_by_the_order_asked_for(tmp_path):

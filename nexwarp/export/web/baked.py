@@ -9,7 +9,7 @@ import torch
 from nexwarp.cameras.camera import Camera
 from nexwarp.export.bake import Baked
 from nexwarp.export.bake import bake as bake_model
-from nexwarp.export.web.scene_file import SceneData, array_of, joined_file, scene_header
+from nexwarp.export.web.scene_file import array_of, joined_file, scene_arrays, scene_header
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
 
@@ -32,22 +32,23 @@ def encode_baked(baked: Baked, cameras: Mapping[str, Camera]) -> dict[str, bytes
     model, layout = baked.model, baked.layout
     picture, scale = encode_picture(baked.atlas)
     harmonics, ranges = encode_harmonics(baked.surfels)
-    scene = SceneData.of(Model(baked.surfels, None, model.exposures, model.detail_limits, model.options, model.meta))
-    quats = np.rint((scene.quats.astype(np.float64) + 1) / 2 * 65535)
-    farthest = scene.limits[:, 1] if scene.limits is not None else np.full(len(scene), LARGEST_FLOAT, np.float32)
+    bare = Model(baked.surfels, None, model.exposures, model.detail_limits, model.options, model.meta)
+    scene = scene_arrays(bare)
+    quats = np.rint((scene["quats"].astype(np.float64) + 1) / 2 * 65535)
+    count = len(scene["means"])
+    farthest = scene["limits"][:, 1] if "limits" in scene else np.full(count, LARGEST_FLOAT, np.float32)
     arrays = {
-        "means": scene.means,
+        "means": scene["means"],
         "quats": quats.clip(0, 65535).astype(np.uint16),
-        **{name: getattr(scene, name) for name in ("scales", "opacities", "gammas")},
+        **{name: scene[name] for name in ("scales", "opacities", "gammas")},
         "farthest": farthest.clip(0, LARGEST_FLOAT),
         "boxes": array_of(layout.boxes),
         "rects": layout.rects.cpu().numpy().astype(np.uint16),
-        "sh0": scene.sh[:, 0],
+        "sh0": scene["sh"][:, 0],
+        **{name: scene[name] for name in ("exposures",) if name in scene},
+        "shN": harmonics,
     }
-    if scene.exposures is not None:
-        arrays["exposures"] = scene.exposures["poses"]
-    arrays["shN"] = harmonics
-    header = scene_header(scene, cameras, "") | {
+    header = scene_header(bare, scene, cameras, "") | {
         "atlas": {"file": ATLAS_FILE, "width": layout.width, "height": layout.height, "scale": scale},
         "sh_ranges": ranges,
     }

@@ -4,7 +4,6 @@ import json
 import struct
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,9 +12,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import focus_ahead, up_direction
 from nexwarp.errors import FormatError, SettingError
 from nexwarp.export.web import quantise
-from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
-from nexwarp.model.options import RenderOptions
 from nexwarp.model.texture import NeuralTexture
 
 SCENE_FILE = "scene.nxw"
@@ -27,60 +24,32 @@ LARGEST_HEADER = 4 * 2**20
 ALIGNMENT = 8
 DTYPES = {"u1": "u8", "u2": "u16", "u4": "u32", "f2": "f16", "f4": "f32"}
 MOST_CAMERAS = 200
+DRAWN_OPTIONS = ("max_hits", "background", "sh_degree", "clamp_texture", "exposure")
 
 
-@dataclass(frozen=True)
-class SceneData:
-    """A scene, activated: N surfels, float32, and what a rendering needs beside them."""
+@torch.no_grad()
+def scene_arrays(model: Model) -> dict[str, np.ndarray]:
+    """Return N activated surfels, float32: "means", "quats" (wxyz), "scales", "opacities", "gammas", "sh" (N, C, 3).
 
-    means: np.ndarray  # (N, 3) world units
-    quats: np.ndarray  # (N, 4) unit, wxyz, surfel to world
-    scales: np.ndarray  # (N, 2) world units
-    opacities: np.ndarray  # (N,)
-    gammas: np.ndarray  # (N, 2)
-    limits: np.ndarray | None  # (N, 2) detail limits, nearest and farthest; None limits nothing
-    sh: np.ndarray  # (N, C, 3) coefficients of the plain colour
-    options: RenderOptions
-    texture: NeuralTexture | None
-    # Of V photos, see `Exposures`: "poses" (V, 9), position, direction and coefficients of each; "mean" (3,), "lengths"
-    # (2,), "falloff" (3,); "lowest" and "highest" (3,), the extreme log gains.
-    exposures: dict[str, np.ndarray] | None
-
-    @classmethod
-    @torch.no_grad()
-    def of(cls, model: Model) -> "SceneData":
-        """Take the values of a model; FormatError: it has too many surfels for a file, or blends them by distance."""
-        surfels, options = model.surfels, model.options
-        if len(surfels) > LARGEST_SURFELS:
-            raise FormatError(f"model: expected at most {LARGEST_SURFELS:,} surfels, got {len(surfels):,}")
-        if options.order != "depth":
-            raise FormatError(f"order: expected depth, which the web page draws, got {options.order}")
-        texture = model.texture if options.max_hits else None
-        if not isinstance(texture, NeuralTexture | None):
-            name = type(texture).__name__
-            raise FormatError(f"texture: expected a nexwarp.NeuralTexture, which the web page draws, got {name}")
-        limits = model.detail_limits if options.detail_limits else None
-        return cls(
-            **{name: array_of(x) for name, x in surfels.activated()._asdict().items()},
-            limits=None if limits is None else array_of(torch.stack([limits.nearest, limits.farthest], 1)),
-            sh=array_of(surfels.sh),
-            options=options,
-            texture=texture,
-            exposures=_exposures(model.exposures) if options.exposure == "photos" else None,
-        )
-
-    def __len__(self) -> int:
-        return len(self.means)
-
-
-def _exposures(exposures: Exposures | None) -> dict[str, np.ndarray] | None:
-    if exposures is None:
-        return None
-    values = {name: array_of(x) for name, x in exposures.named_buffers()}
-    poses = np.concatenate([values[name] for name in ("positions", "directions", "coefficients")], axis=1)
-    gains = values["log_gains"]
-    kept = {name: values[name] for name in ("mean", "lengths", "falloff")}
-    return {"poses": poses, **kept, "lowest": gains.min(0), "highest": gains.max(0)}
+    Where the model has them, with "limits" (N, 2), nearest and farthest, and "exposures" (V, 9), position, direction
+    and coefficients of each photo. FormatError: the model is not what the web page draws.
+    """
+    surfels, options = model.surfels, model.options
+    if len(surfels) > LARGEST_SURFELS:
+        raise FormatError(f"model: expected at most {LARGEST_SURFELS:,} surfels, got {len(surfels):,}")
+    if options.order != "depth":
+        raise FormatError(f"order: expected depth, which the web page draws, got {options.order}")
+    if options.max_hits and not isinstance(model.texture, NeuralTexture | None):
+        name = type(model.texture).__name__
+        raise FormatError(f"texture: expected a nexwarp.NeuralTexture, which the web page draws, got {name}")
+    arrays = surfels.activated()._asdict()
+    if model.detail_limits is not None and options.detail_limits:
+        arrays["limits"] = torch.stack([model.detail_limits.nearest, model.detail_limits.farthest], 1)
+    arrays["sh"] = surfels.sh
+    exposures = model.exposures
+    if exposures is not None and options.exposure == "photos":
+        arrays["exposures"] = torch.cat([exposures.positions, exposures.directions, exposures.coefficients], 1)
+    return {name: array_of(x) for name, x in arrays.items()}
 
 
 def array_of(tensor: torch.Tensor) -> np.ndarray:
@@ -102,33 +71,30 @@ def encode_scene(
     """
     if quality not in QUALITIES:
         raise SettingError(f"--quality: expected {' or '.join(QUALITIES)}, got {quality!r:.60}")
-    scene = SceneData.of(model)
-    if quality == "full":
-        names = ("means", "quats", "scales", "opacities", "gammas", "limits", "sh")
-        arrays = {name: array for name in names if (array := getattr(scene, name)) is not None}
-    else:
-        arrays = quantised(scene)
-    if scene.exposures is not None:
-        arrays["exposures"] = scene.exposures["poses"]
-    if scene.texture is not None:
-        grid = array_of(scene.texture.grid).astype(np.float16)  # as in model files
-        weights = np.concatenate([array_of(matrix).ravel() for matrix in scene.texture.mlp.parameters()])
+    arrays = scene_arrays(model)
+    header = scene_header(model, arrays, cameras, title) | {"quality": quality}
+    if quality == "quantised":
+        arrays = quantised(arrays)
+    if header["texture"]:
+        assert isinstance(model.texture, NeuralTexture)
+        grid = array_of(model.texture.grid).astype(np.float16)  # as in model files
+        weights = np.concatenate([array_of(matrix).ravel() for matrix in model.texture.mlp.parameters()])
         if quality == "full":
             arrays |= {"mlp": weights, "grid": grid}
         else:
             codes, ranges = quantise.encode_levels(grid)
             arrays |= {"mlp": weights.astype(np.float16), "grid_ranges": ranges, "grid": codes}
-    header = scene_header(scene, cameras, title) | {"quality": quality}
     return joined_file(MAGIC, header, arrays, poster)
 
 
-def quantised(scene: SceneData) -> dict[str, np.ndarray]:
-    """Return the sections of the surfels by name, in the order of the file; surfels are in Morton order."""
-    order = quantise.morton_order(scene.means)
-    quats, swapped = quantise.encode_quats(scene.quats[order])
-    scales, gammas = (np.where(swapped[:, None], x[order, ::-1], x[order]) for x in (scene.scales, scene.gammas))
-    sh = scene.sh[order]
-    means, mean_ranges = quantise.encode_chunks(scene.means[order].astype(np.float64), np.uint16)
+def quantised(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the sections of `scene_arrays` by name, in the order of the file; surfels are in Morton order."""
+    order = quantise.morton_order(arrays["means"])
+    surfels = {name: array[order] for name, array in arrays.items() if name != "exposures"}
+    quats, swapped = quantise.encode_quats(surfels["quats"])
+    scales, gammas = (np.where(swapped[:, None], x[:, ::-1], x) for x in (surfels["scales"], surfels["gammas"]))
+    sh = surfels["sh"]
+    means, mean_ranges = quantise.encode_chunks(surfels["means"].astype(np.float64), np.uint16)
     scale_codes, scale_ranges = quantise.encode_chunks(quantise.log_of(scales), np.uint16)
     gamma_codes, gamma_ranges = quantise.encode_chunks(quantise.log_of(gammas), np.uint8)
     degrees = range(round(sh.shape[1] ** 0.5))
@@ -138,14 +104,14 @@ def quantised(scene: SceneData) -> dict[str, np.ndarray]:
         "means": means.T,
         "quats": quats,
         "scales": scale_codes.T,
-        "opacities": np.rint(scene.opacities[order].clip(0, 1) * 255).astype(np.uint8),
+        "opacities": np.rint(surfels["opacities"].clip(0, 1) * 255).astype(np.uint8),
         "gammas": gamma_codes.T,
     }
-    if scene.limits is not None:
-        codes, sections["limits_scale"] = quantise.encode_limits(scene.limits[order])
+    if "limits" in surfels:
+        codes, sections["limits_scale"] = quantise.encode_limits(surfels["limits"])
         sections["limits"] = codes.T
     sections["sh"] = np.concatenate([band[0] for band in bands], axis=1).T
-    return sections
+    return sections | {name: arrays[name] for name in ("exposures",) if name in arrays}
 
 
 def joined_file(
@@ -176,27 +142,25 @@ def joined_file(
     return b"".join([magic, struct.pack("<II", FORMAT_VERSION, len(text)), text, *parts])
 
 
-def scene_header(scene: SceneData, cameras: Mapping[str, Camera], title: str) -> dict[str, object]:
-    """Return the header without quality and sections."""
-    options, texture, exposures = scene.options, scene.texture, scene.exposures
+def scene_header(
+    model: Model, arrays: Mapping[str, np.ndarray], cameras: Mapping[str, Camera], title: str
+) -> dict[str, object]:
+    """Return the header of a model and its `scene_arrays`, without quality and sections."""
+    options, exposures, means = model.options, model.exposures, arrays["means"]
     kept = list(cameras.items())[:: -(-len(cameras) // MOST_CAMERAS) or 1]
     views = [camera for _, camera in kept]
-    low, high = (np.percentile(scene.means, q, axis=0) if len(scene) else np.zeros(3) for q in (2, 98))
+    low, high = (np.percentile(means, q, axis=0) if len(means) else np.zeros(3) for q in (2, 98))
     center, share = focus_ahead(views)
     header: dict[str, object] = {
         "format_version": FORMAT_VERSION,
         "generator": "nexwarp",
         "title": title,
-        "surfels": len(scene),
-        "sh_coefficients": scene.sh.shape[1],
+        "surfels": len(means),
+        "sh_coefficients": arrays["sh"].shape[1],
         "chunk": quantise.CHUNK,
         "options": {
-            "max_hits": options.max_hits,
-            "background": list(options.background),
-            "sh_degree": options.sh_degree,
-            "clamp_texture": options.clamp_texture,
-            "exposure": options.exposure,
-            "detail_limits": scene.limits is not None,
+            **{name: getattr(options, name) for name in DRAWN_OPTIONS},
+            "detail_limits": "limits" in arrays,
         },
         "texture": None,
         "exposures": None,
@@ -218,11 +182,14 @@ def scene_header(scene: SceneData, cameras: Mapping[str, Camera], title: str) ->
         "bounds": [_floats(low), _floats(high)],
         "poster": None,
     }
-    if texture is not None:
-        header["texture"] = {**texture.config, "resolutions": _floats(array_of(texture.resolutions))}
-    if exposures is not None:
-        numbers = {name: _floats(values) for name, values in exposures.items() if name != "poses"}
-        header["exposures"] = {"count": len(exposures["poses"]), **numbers}
+    if isinstance(model.texture, NeuralTexture) and options.max_hits:
+        resolutions = _floats(array_of(model.texture.resolutions))
+        header["texture"] = {**model.texture.config, "resolutions": resolutions}
+    if exposures is not None and "exposures" in arrays:
+        gains = exposures.log_gains
+        tensors = {"mean": exposures.mean, "lengths": exposures.lengths, "falloff": exposures.falloff}
+        tensors |= {"lowest": gains.amin(0), "highest": gains.amax(0)}
+        header["exposures"] = {"count": len(gains)} | {name: _floats(array_of(x)) for name, x in tensors.items()}
     return header
 
 

@@ -17,18 +17,8 @@ from nexwarp.export.bake import bake
 from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE
 from nexwarp.export.web.export import page_files, static_files
 from nexwarp.export.web.scene_file import SCENE_FILE
-from tests.export.web.support import (
-    CHROMIUM,
-    URL,
-    WEBGPU,
-    Tab,
-    as_stored,
-    entry_of,
-    psnr,
-    read_sections,
-    rendered,
-    ring,
-)
+from tests.export.web import support
+from tests.export.web.support import CHROMIUM, URL, WEBGPU, Tab, psnr, rendered
 from tests.scenes import make_surfels, make_texture, random_scene
 
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
@@ -53,7 +43,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def cameras() -> dict[str, nw.Camera]:
-    return ring()
+    return support.ring()
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +114,7 @@ def tab(open_tab) -> PageTab:
 
 
 def test_the_baked_scene_in_the_page_is_the_one_of_python(tab, model, cameras):
-    baked = as_stored(bake(model, list(cameras.values()), steps=10))
+    baked = support.as_stored(bake(model, list(cameras.values()), steps=10))
     tab.open("?renderer=baked")
     picked = 0
     # Far away too: surfels are blurred beyond their detail limits.
@@ -135,7 +125,7 @@ def test_the_baked_scene_in_the_page_is_the_one_of_python(tab, model, cameras):
     depths = model.render(cameras["1.png"]).depths[..., 0].detach()
     cut = replace(cameras["1.png"], near=depths[depths > 0].median().item())
     for camera in (cameras["1.png"], cameras["3.png"], far, cut):
-        drawn = tab.value(DRAW, entry_of(camera))
+        drawn = tab.value(DRAW, support.entry_of(camera))
         image = torch.tensor(drawn[0]).reshape(camera.height, camera.width, 4)[..., :3]
         with torch.no_grad():
             expected = (rendered(baked, camera) * model.exposures.factors(camera)).clamp(0, 1)
@@ -299,7 +289,7 @@ def test_the_live_demo_of_the_documentation(tab):
     tab.files = {**static_files(), **files}
     tab.open("?renderer=baked")
     assert tab.picture().std() > 0.1 and not tab.errors
-    header, _ = read_sections(files[SCENE_FILE])
+    header, _ = support.read_sections(files[SCENE_FILE])
     assert header["surfels"] == tab.value("nexwarp.renderer.info.surfels")
 
 

@@ -11,7 +11,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.export.web.quantise import CHUNK, encode_chunks, encode_limits, encode_quats, morton_order
-from nexwarp.export.web.scene_file import SceneData, encode_scene
+from nexwarp.export.web.scene_file import encode_scene, scene_arrays
 from nexwarp.model.detail_limits import NEVER
 from nexwarp.model.options import RenderOptions
 from tests.export.web import support
@@ -27,29 +27,28 @@ def content_of(quality: str = "quantised") -> bytes:
 
 def test_a_full_file_holds_every_bit():
     model, _ = web_model()
-    expected, (header, arrays) = SceneData.of(model), read_sections(content_of("full"))
+    expected, (header, arrays) = scene_arrays(model), read_sections(content_of("full"))
     for name in ("means", "quats", "scales", "opacities", "gammas", "limits", "sh"):
-        np.testing.assert_array_equal(arrays[name], getattr(expected, name))
+        np.testing.assert_array_equal(arrays[name], expected[name])
     assert header["options"]["background"] == list(model.options.background)
-    assert isinstance(model.texture, nw.NeuralTexture) and expected.exposures is not None
+    assert isinstance(model.texture, nw.NeuralTexture)
     np.testing.assert_array_equal(arrays["grid"], model.texture.grid.detach().numpy())
     np.testing.assert_array_equal(np.float32(header["texture"]["resolutions"]), model.texture.resolutions.numpy())
     weights = [matrix.detach().numpy().ravel() for matrix in model.texture.mlp.parameters()]
     np.testing.assert_array_equal(arrays["mlp"], np.concatenate(weights))
-    np.testing.assert_array_equal(arrays["exposures"], expected.exposures["poses"])
+    np.testing.assert_array_equal(arrays["exposures"], expected["exposures"])
 
 
 def test_a_quantised_file_holds_the_surfels_in_morton_order():
     model, _ = web_model()
     order = morton_order(model.surfels.means.detach().numpy())
-    surfels, expected = read_surfels(content_of()), SceneData.of(model)
+    surfels, expected = read_surfels(content_of()), scene_arrays(model)
     for name, bound in (("means", 1e-4), ("opacities", 0.002), ("sh", 0.02)):
-        np.testing.assert_allclose(surfels[name], getattr(expected, name)[order], atol=bound, err_msg=name)
+        np.testing.assert_allclose(surfels[name], expected[name][order], atol=bound, err_msg=name)
     for name in ("scales", "gammas"):  # the axes may be swapped
-        values, wanted = (np.sort(x, axis=1) for x in (surfels[name], getattr(expected, name)[order]))
+        values, wanted = (np.sort(x, axis=1) for x in (surfels[name], expected[name][order]))
         np.testing.assert_allclose(values, wanted, rtol=0.01, err_msg=name)
-    assert expected.limits is not None
-    np.testing.assert_allclose(surfels["limits"], expected.limits[order], rtol=1e-3)
+    np.testing.assert_allclose(surfels["limits"], expected["limits"][order], rtol=1e-3)
 
 
 def test_values_in_chunks_return_within_half_a_step():
