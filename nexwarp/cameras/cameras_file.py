@@ -23,18 +23,16 @@ def save_cameras(
     cameras: Mapping[str, Mapping[str, Camera]],
     before: Mapping[str, Mapping[str, Camera]] | None = None,
 ) -> None:
-    """Write cameras as JSON: set ("train", "test") -> name -> camera, and `origin` of their frame where it has one.
+    """Write cameras as JSON: set ("train", "test") -> name -> camera, and the `origin` of their frame if it has one.
 
     `before` are the same cameras before their poses were refined; those that differ are written, too.
     """
     data: dict[str, object] = {}
-    origins = {camera.origin or WORLD for members in cameras.values() for camera in members.values()}
-    if len(origins) > 1:
-        raise ValueError(f"cameras: expected one origin, got {len(origins)}")
-    if origins - {WORLD}:
+    origins = {camera.origin or WORLD for members in cameras.values() for camera in members.values()} - {WORLD}
+    if origins:
         data["origin"] = list(*origins)
     for group, members in cameras.items():
-        entries: dict[str, dict[str, object]] = {}
+        entries = {}
         for name, camera in members.items():
             entry: dict[str, object] = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
             entry |= {"width": camera.width, "height": camera.height, "near": camera.near}

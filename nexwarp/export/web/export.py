@@ -12,7 +12,6 @@ from pathlib import Path
 import torch
 
 from nexwarp.cameras.camera import Camera, resized
-from nexwarp.errors import FormatError
 from nexwarp.export.web.baked import bake
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
 from nexwarp.io.files import write_together
@@ -67,20 +66,15 @@ def static_files() -> Mapping[str, bytes]:
 def one_file(content: Mapping[str, bytes]) -> bytes:
     """Return a page's files as one HTML file: modules in the import map, the others as elements with base64 text."""
     encoded = {name: base64.b64encode(data).decode() for name, data in content.items()}
-    modules = {
-        f"nexwarp/{name}": f"data:text/javascript;base64,{text}"
-        for name, text in encoded.items()
-        if name.endswith(".js")
-    }
+    scripts = {name: f"data:text/javascript;base64,{text}" for name, text in encoded.items() if name.endswith(".js")}
+    modules = {f"nexwarp/{name}": address for name, address in scripts.items()}
     assets = "".join(
         f'<script type="application/octet-stream" id="asset:{name}">{text}</script>\n'
         for name, text in encoded.items()
         if name != INDEX and not name.endswith((".js", ".css"))
     )
     page = content[INDEX].decode()
-    first_script = page.find("<script", page.find("<body"))
-    if IMPORT_MAP not in page or first_script < 0:
-        raise FormatError(f"{INDEX}: expected the import map {IMPORT_MAP} and a script in the body")
+    first_script = page.index("<script", page.index("<body"))
     head, body = page[:first_script], page[first_script:]
     head = head.replace(IMPORT_MAP, json.dumps({"imports": modules}))
     head = head.replace(STYLE_LINK, f"<style>{content['style.css'].decode()}</style>")

@@ -20,7 +20,6 @@ QUALITIES = ("quantised", "full")
 MAGIC = b"NXWSCENE"
 FORMAT_VERSION = 1
 LARGEST_SURFELS = 2**24
-LARGEST_HEADER = 4 * 2**20
 ALIGNMENT = 8
 DTYPES = {"u1": "u8", "u2": "u16", "u4": "u32", "f2": "f16", "f4": "f32"}
 MOST_CAMERAS = 200
@@ -137,8 +136,6 @@ def joined_file(
         position += len(parts[-1])
     text = json.dumps({**header, "sections": entries}, allow_nan=False, separators=(",", ":")).encode()
     text += b" " * (-len(text) % ALIGNMENT)
-    if len(text) > LARGEST_HEADER:
-        raise FormatError(f"header: expected at most {LARGEST_HEADER:,} bytes, got {len(text):,}")
     return b"".join([magic, struct.pack("<II", FORMAT_VERSION, len(text)), text, *parts])
 
 
@@ -158,10 +155,7 @@ def scene_header(
         "surfels": len(means),
         "sh_coefficients": arrays["sh"].shape[1],
         "chunk": quantise.CHUNK,
-        "options": {
-            **{name: getattr(options, name) for name in DRAWN_OPTIONS},
-            "detail_limits": "limits" in arrays,
-        },
+        "options": {**{name: getattr(options, name) for name in DRAWN_OPTIONS}, "detail_limits": "limits" in arrays},
         "texture": None,
         "exposures": None,
         "near": views[0].near if views else 0.01,
