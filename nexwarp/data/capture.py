@@ -26,42 +26,25 @@ LARGEST_COORDINATE = 1e15  # its square is finite in single precision
 
 @dataclass(frozen=True)
 class Photo:
-    """A posed photo, without its pixels.
+    """A posed photo, without its pixels."""
 
-    Attributes:
-        name: path below the images folder, with "/" as separator; unique in a scene.
-        file: the image file.
-        viewmat: (4, 4) float64, world to camera, OpenCV axes; the "world" of a capture's photos has its `origin`.
-        lens: the camera of the photo; the size of the image file may differ from the lens's by a factor.
-        mask: the mask's file; None if the scene names none.
-        face: name of the face of a panorama, a key of `nexwarp.data.lens.FACES`; None for other photos.
-        points: (M, 3) float32 world positions of the points that were triangulated from it; None if unknown.
-    """
-
-    name: str
+    name: str  # path below the images folder, with "/" as separator; unique in a scene
     file: Path
-    viewmat: np.ndarray
-    lens: Lens
-    mask: Path | None = None
-    face: str | None = None
-    points: np.ndarray | None = None
+    viewmat: np.ndarray  # (4, 4) float64, world to camera, OpenCV axes; a capture's "world" has its `origin`
+    lens: Lens  # the size of the image file may differ from the lens's by a factor
+    mask: Path | None = None  # None if the scene names none
+    face: str | None = None  # of a panorama, a key of `nexwarp.data.lens.FACES`; None for other photos
+    points: np.ndarray | None = None  # (M, 3) float32 world positions that were triangulated from it; None if unknown
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """The points of a scene.
+    """The points of a scene."""
 
-    Attributes:
-        positions: (P, 3) float64.
-        colors: (P, 3) uint8 sRGB.
-        track_lengths: (P,) int32, number of photos that see a point; 0 if unknown.
-        reprojection_errors: (P,) float32, mean over the track, in pixels of the original photos; -1 if unknown.
-    """
-
-    positions: np.ndarray
-    colors: np.ndarray
-    track_lengths: np.ndarray
-    reprojection_errors: np.ndarray
+    positions: np.ndarray  # (P, 3) float64
+    colors: np.ndarray  # (P, 3) uint8 sRGB
+    track_lengths: np.ndarray  # (P,) int32, number of photos that see a point; 0 if unknown
+    reprojection_errors: np.ndarray  # (P,) float32, mean over the track, pixels of the original photos; -1 if unknown
 
     def moved(self, origin: np.ndarray) -> "Cloud":
         """Return the points in the frame with another origin (3,) in the coordinates of theirs."""
@@ -76,23 +59,14 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Capture:
-    """The photos and points of a scene.
+    """The photos and points of a scene."""
 
-    Attributes:
-        source: the file or folder that the cameras were read from.
-        photos: the photos, sorted by name.
-        cloud: the points; None if the scene has none.
-        origin: (3,) float64, world coordinates of the origin of the frame of photos and cloud; see `Scene.origin`.
-        test: names of the test photos; None for every eighth photo.
-        background: default colour behind transparent photos; None drops their alpha.
-    """
-
-    source: Path
-    photos: list[Photo]
-    cloud: Cloud | None
-    origin: np.ndarray
-    test: frozenset[str] | None = None
-    background: tuple[float, float, float] | None = None
+    source: Path  # the file or folder that the cameras were read from
+    photos: list[Photo]  # sorted by name
+    cloud: Cloud | None  # None if the scene has none
+    origin: np.ndarray  # (3,) float64, world coordinates of the origin of photos and cloud; see `Scene.origin`
+    test: frozenset[str] | None = None  # names of the test photos; None for every eighth photo
+    background: tuple[float, float, float] | None = None  # behind transparent photos; None drops their alpha
 
     @classmethod
     def of(
@@ -163,10 +137,8 @@ def scene_errors() -> Iterator[None]:
 def safe_name(where: str, name: str, folder: str, root: Path | None = None) -> str:
     """Normalise a path relative to the `folder` of a message: "/" as separator, without ".".
 
-    An absolute path below `root`, the folder itself, becomes a relative one.
-
-    Raises:
-        ValueError: the path is not printable, is absolute or has ".." on any operating system, or is too long.
+    An absolute path below `root`, the folder itself, becomes a relative one. ValueError: the path is not printable, is
+    absolute or has ".." on any operating system, or is too long.
     """
     for base in () if root is None or not Path(name).is_absolute() else (root.absolute(), root.resolve()):
         if Path(name).is_relative_to(base):
@@ -197,11 +169,7 @@ def find_file(folder: Path, name: str) -> Path:
 
 
 def inside_folder(where: str, path: Path, folder: Path, follow_links: bool) -> Path:
-    """Return a path below `folder`, which may be a link itself.
-
-    Raises:
-        ValueError: a symbolic link leads out of the folder, and `follow_links` does not allow it.
-    """
+    """Return a path below `folder`, which may be a link itself; ValueError if a link leads out and may not."""
     if follow_links:
         return path
     try:
@@ -215,10 +183,7 @@ def inside_folder(where: str, path: Path, folder: Path, follow_links: bool) -> P
 
 
 def report_missing(source: Path, names: Sequence[str], count: int, skip: bool) -> None:
-    """Raise FileNotFoundError naming the photos of `count` that do not exist.
-
-    With `skip`, warn instead, as long as two photos are left.
-    """
+    """Raise FileNotFoundError naming the photos of `count` that do not exist; with `skip` warn, if two are left."""
     if not names:
         return
     absent = f"{source}: {len(names)} of {count} photos: image not found: {_listed(names, MOST_NAMED)}"

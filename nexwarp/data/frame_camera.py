@@ -28,17 +28,10 @@ LENS_KEYS |= {"camera_model", "is_fisheye", "is_equirectangular", "equirectangul
 
 
 def frame_lens(where: str, frame: JsonObject, shared: JsonObject, file: Path) -> Lens:
-    """Read the lens of a frame.
+    """Read the lens of a frame, whose keys go before `shared`, those of the JSON file.
 
-    Args:
-        where: place of the frame, for messages.
-        frame: the frame's keys, which go before `shared`, those of the file.
-        shared: the keys of the JSON file.
-        file: the image file, whose size is used if `w` or `h` is missing.
-
-    Raises:
-        ValueError: a size, camera model, coefficient or focal length is missing or invalid, or a key of a lens or
-            shutter is not known.
+    The size of the image `file` is used if `w` or `h` is missing. ValueError: a size, camera model, coefficient or
+    focal length is missing or invalid, or a key of a lens or shutter is not known.
     """
     keys = merged(frame, shared)
     columns: float
@@ -139,18 +132,9 @@ def _check_rotation(where: str, key: str, rotation: np.ndarray, what: str) -> No
 
 
 def frame_viewmat(where: str, frame: JsonObject, to_original: np.ndarray) -> np.ndarray:
-    """Convert a frame's `transform_matrix` to a world-to-camera matrix with OpenCV axes in the original world frame.
+    """Return the world-to-camera matrix (4, 4) float64, with OpenCV axes, of a frame's `transform_matrix`.
 
-    Args:
-        where: place of the frame, for messages.
-        frame: with the camera-to-world matrix with OpenGL axes in the file's world frame.
-        to_original: (4, 4) float64 similarity of `inverse_applied`.
-
-    Returns:
-        (4, 4) float64.
-
-    Raises:
-        ValueError: the matrix is not a rigid motion.
+    That is camera to world with OpenGL axes in the file's world frame; `to_original` is of `inverse_applied`.
     """
     pose = matrix_of(where, frame, "transform_matrix").numpy()
     _check_rotation(where, "transform_matrix", pose[:3, :3], "a rotation and a position")
@@ -163,14 +147,7 @@ def frame_viewmat(where: str, frame: JsonObject, to_original: np.ndarray) -> np.
 
 
 def inverse_applied(file: Path, data: JsonObject) -> np.ndarray:
-    """Invert `applied_transform` and `applied_scale`.
-
-    Returns:
-        (4, 4) float64 similarity from the file's world frame to the original one.
-
-    Raises:
-        ValueError: `applied_transform` is not a similarity, or `applied_scale` is not positive.
-    """
+    """Invert `applied_transform` and `applied_scale`: (4, 4) float64 from the file's world frame to the original."""
     applied = np.eye(4)
     if data.get("applied_transform") is not None:
         applied = matrix_of(str(file), data, "applied_transform").numpy()

@@ -3,7 +3,7 @@
 import io
 import os
 import warnings
-from collections.abc import Container, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -66,7 +66,8 @@ def _opened(path: Path) -> Iterator["PIL.Image.Image"]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: image not found, but the COLMAP model names it")
     try:
-        formats = [name for name in FORMATS if name in _registered()]
+        Image.init()  # so that it knows the formats that this build can decode
+        formats = [name for name in FORMATS if name in Image.OPEN]
         with _Bounded(path) as file, Image.open(file, formats=formats) as image:
             # PIL's own check can be disabled by other libraries.
             pixels = image.width * image.height
@@ -89,14 +90,6 @@ def _opened(path: Path) -> Iterator["PIL.Image.Image"]:
         ) from None
     except Exception as error:  # PIL's decoders raise many types for damaged files
         raise ValueError(f"{path}: expected a complete image file, could not decode it: {one_line(error)}") from error
-
-
-def _registered() -> Container[str]:
-    """Names of the formats that this build of PIL can decode."""
-    from PIL import Image
-
-    Image.init()
-    return Image.OPEN
 
 
 def _check_numbers(path: Path, image: "PIL.Image.Image") -> None:
@@ -148,13 +141,7 @@ def _full_range(image: "PIL.Image.Image", bits: int, inverted: bool) -> "PIL.Ima
 
 
 def read_image(path: Path) -> torch.Tensor:
-    """Read a photo as COLMAP does: EXIF orientation is ignored, grey is repeated, alpha is dropped.
-
-    Args:
-        path: a JPEG, PNG, WebP, TIFF, BMP, PPM, GIF, TGA, JPEG 2000 or AVIF file, up to 16 bits a channel, unsigned.
-
-    Returns:
-        (H, W, 3) uint8 sRGB.
+    """Read a photo (H, W, 3) uint8 sRGB as COLMAP does: without EXIF orientation, grey repeated, alpha dropped.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -166,14 +153,7 @@ def read_image(path: Path) -> torch.Tensor:
 
 
 def read_transparent(path: Path) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Read a photo with its transparency.
-
-    Returns:
-        (H, W, 3) uint8 sRGB as of `read_image`, and (H, W) uint8 alpha; None if the file has no transparency.
-
-    Raises:
-        FileNotFoundError, ValueError: as of `read_image`.
-    """
+    """Read a photo as `read_image`, and its (H, W) uint8 alpha; None if the file has no transparency."""
     with _loaded(path) as image:
         if not image.has_transparency_data:
             return torch.from_numpy(_to_rgb(image)), None
@@ -185,17 +165,10 @@ def read_transparent(path: Path) -> tuple[torch.Tensor, torch.Tensor | None]:
 
 
 def read_mask(path: Path) -> torch.Tensor:
-    """Read a mask, whose white pixels are used.
+    """Read a mask (H, W) bool: True for values of at least 128, of 16 bits 32768; without any, for those above 0.
 
     The value of a pixel is its brightness, on black where it is transparent. In a palette file it is the index, as in
     label maps, unless the palette's colours in use are grey, or black and one other colour.
-
-    Returns:
-        (H, W) bool, True for values of at least 128, of 16 bits 32768; if the file has no such value, True for values
-        above 0.
-
-    Raises:
-        FileNotFoundError, ValueError: as of `read_image`.
     """
     with _loaded(path) as image:
         values, white = _mask_values(image), WHITE
@@ -250,16 +223,7 @@ def _to_rgb(image: "PIL.Image.Image") -> np.ndarray:
 
 
 def compose(image: torch.Tensor, alpha: torch.Tensor, background: tuple[float, float, float]) -> torch.Tensor:
-    """Composite a transparent photo on a colour, in sRGB.
-
-    Args:
-        image: (H, W, 3) uint8, not premultiplied.
-        alpha: (H, W) uint8.
-        background: three numbers in [0, 1].
-
-    Returns:
-        (H, W, 3) uint8.
-    """
+    """Composite a photo (H, W, 3) uint8, not premultiplied, of alpha (H, W) uint8 on a colour in [0, 1], in sRGB."""
     out = torch.empty_like(image)
     for channel, color in enumerate(background):
         a = alpha.float() / 255.0
@@ -285,14 +249,9 @@ def resize_mask(mask: torch.Tensor, width: int, height: int) -> torch.Tensor:
 
 
 def downscale_image(image: torch.Tensor, factor: int) -> torch.Tensor:
-    """Average blocks of `factor` x `factor` pixels; incomplete blocks at the right and bottom are cropped.
+    """Average blocks of `factor` x `factor` pixels of an image (H, W, C) uint8; incomplete ones are cropped.
 
-    Args:
-        image: (H, W, C) uint8.
-        factor: at least 1, at most min(H, W).
-
-    Returns:
-        (H // factor, W // factor, C) uint8, the mean of the 8-bit values rounded to the nearest (half up).
+    Returns (H // factor, W // factor, C) uint8, the mean of the 8-bit values rounded to the nearest (half up).
     """
     if factor == 1:
         return image

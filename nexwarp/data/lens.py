@@ -85,22 +85,11 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class Lens:
-    """The camera of a photo before undistortion: one of COLMAP's camera models, or BROWN.
+    """The camera of a photo before undistortion; ValueError where model, parameters or size are not usable."""
 
-    Attributes:
-        model: COLMAP's name, such as OPENCV; or BROWN.
-        params: parameters in COLMAP's order, in pixels of a width x height image; of BROWN those of `BROWN_PARAMS`.
-        width: width of the photo in pixels.
-        height: height of the photo in pixels.
-
-    Raises:
-        ValueError: an unknown model, a wrong number of parameters, a parameter that is not finite, a focal length or
-            size that is not positive.
-    """
-
-    model: str
-    params: tuple[float, ...]
-    width: int
+    model: str  # COLMAP's name, such as OPENCV; or BROWN
+    params: tuple[float, ...]  # in COLMAP's order, in pixels of a width x height image; of BROWN `BROWN_PARAMS`
+    width: int  # of the photo in pixels
     height: int
 
     def __post_init__(self) -> None:
@@ -223,15 +212,10 @@ class Lens:
 
 @dataclass(frozen=True)
 class Map:
-    """The positions in the photo of the pixels of an undistorted image.
+    """The positions in the photo of the pixels of an undistorted image."""
 
-    Attributes:
-        grid: (1, h, w, 2) float32, for `torch.nn.functional.grid_sample`.
-        valid: (h, w) bool, True inside the photo; None if all pixels are.
-    """
-
-    grid: torch.Tensor
-    valid: torch.Tensor | None
+    grid: torch.Tensor  # (1, h, w, 2) float32, for `torch.nn.functional.grid_sample`
+    valid: torch.Tensor | None  # (h, w) bool, True inside the photo; None if all pixels are
 
     def colors(self, image: torch.Tensor) -> torch.Tensor:
         """Resample a photo (H, W, C) uint8 to (h, w, C) uint8; each channel on its own, to save memory."""

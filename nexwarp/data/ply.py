@@ -32,19 +32,12 @@ Element: TypeAlias = tuple[str, int, list[tuple[str, str]] | None]
 
 
 def read_ply(path: Path) -> Cloud:
-    """Read the points of a PLY file, ascii or binary.
+    """Read the points of a PLY file, ascii or binary, perhaps none, in the file's frame; grey without colours.
 
-    Args:
-        path: the file. Its vertices have x, y and z, and optionally colours: red, green, blue (or diffuse_red, ..., or
-            r, g, b) as integers of 8 bits or of the type's full range, floats in [0, 1] or up to 255, or f_dc_0, ... of
-            Gaussian splats. Other properties and elements are ignored.
-
-    Returns:
-        The points in the file's frame, perhaps none; grey if the file has no colours.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: the file is not PLY, is damaged or truncated, or has positions that are not finite.
+    Its vertices have x, y and z, and optionally colours: red, green, blue (or diffuse_red, ..., or r, g, b) as integers
+    of 8 bits or of the type's full range, floats in [0, 1] or up to 255, or f_dc_0, ... of Gaussian splats. Other
+    properties and elements are ignored. ValueError: the file is not PLY, is damaged or truncated, or has positions that
+    are not finite.
     """
     vertices = read_vertices(path)
     lacking = [axis for axis in "xyz" if axis not in (vertices.dtype.names or ())]

@@ -83,12 +83,9 @@ def initial_points(
 
 
 def inliers(count: int, track_lengths: np.ndarray | None, errors: np.ndarray | None) -> np.ndarray:
-    """Return the ascending indices of the points that pass the outlier filter; at least half of all points.
+    """Return the ascending indices of the points that pass the outlier filter; at least half of all `count` points.
 
-    Args:
-        count: number of points P.
-        track_lengths: (P,) integer, 0 if unknown; or None.
-        errors: (P,) float, pixels, negative if unknown; or None.
+    Takes track lengths (P,) integer, 0 if unknown, or None, and errors (P,) in pixels, negative if unknown, or None.
     """
     short = np.zeros(count, dtype=bool)
     if track_lengths is not None:
@@ -107,15 +104,10 @@ def inliers(count: int, track_lengths: np.ndarray | None, errors: np.ndarray | N
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Order points so that each is the farthest from all previous ones.
+    """Return (min(count, distinct),) int64 indices of points (P, 3) float64, each the farthest from those before it.
 
-    Args:
-        points: (P, 3) float64; of several points at one position only the first is used.
-        count: largest number of points.
-
-    Returns:
-        (min(count, distinct),) int64 indices into `points`. The first one is deterministic but not always 0, since
-        fpsample's `start_idx` refers to the order of its own tree (0.3.3 and 1.0.2).
+    Of several points at one position only the first is used. The first index is deterministic but not always 0, since
+    fpsample's `start_idx` refers to the order of its own tree (0.3.3 and 1.0.2).
     """
     from fpsample import bucket_fps_kdline_sampling
 
@@ -133,15 +125,9 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def predecessor_scales(means: np.ndarray) -> np.ndarray:
-    """Half the root mean square distance of each point to its 3 nearest predecessors.
+    """Half the root mean square distance (M,) float64 of each point (M, 3) to its 3 nearest predecessors.
 
-    The search is exact. The first three points use their nearest points among all.
-
-    Args:
-        means: (M, 3) float64, in the order of the sampling.
-
-    Returns:
-        (M,) float64, at least 1e-6 of the extent of `means`.
+    The search is exact. The first three points use their nearest points among all. At least 1e-6 of the points' extent.
     """
     from scipy.spatial import cKDTree
 
@@ -169,14 +155,9 @@ def predecessor_scales(means: np.ndarray) -> np.ndarray:
 
 
 def plane_normals(points: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Unit normals of the planes fitted to the 12 points of a cloud nearest to each query position.
+    """Unit normals (M, 3) of the planes fitted to the 12 of the points (P, 3) nearest to each position `at` (M, 3).
 
-    Args:
-        points: (P, 3) float64, the cloud.
-        at: (M, 3) float64, the query positions.
-
-    Returns:
-        (M, 3) float64; the sign is arbitrary.
+    All are float64; the sign is arbitrary.
     """
     from scipy.spatial import cKDTree
 

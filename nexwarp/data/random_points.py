@@ -19,17 +19,9 @@ def random_points(views: Sequence[View], scale: float, count: int = COUNT, seed:
     """Draw random points in the views' frustums, with the colours of their pixels.
 
     Depths are log-uniform between 0.3 and 3 times the distance to the point nearest to all optical axes or, for
-    parallel axes, between 1 and 30 times the scene's scale. Points that only one view sees are dropped. So are points
-    that a photo shows as fully transparent, as they lie outside the visual hull.
-
-    Args:
-        views: training views.
-        scale: scale of the scene, world units.
-        count: largest number of points.
-        seed: seed of all random numbers.
-
-    Returns:
-        At least one point, in the world frame.
+    parallel axes, between 1 and 30 times the scene's `scale`, world units. Points that only one view sees are dropped.
+    So are points that a photo shows as fully transparent, as they lie outside the visual hull. Returns between 1 and
+    `count` points, in the world frame.
     """
     rng = np.random.default_rng(seed)
     viewmats = np.stack([view.camera.viewmat.numpy().astype(np.float64) for view in views])

@@ -32,17 +32,8 @@ def skybox_points(views: Sequence[View], points: torch.Tensor, count: int) -> In
     3 % of their diagonal there. A point's colour is the mean of the photos' pixels that it projects to, whatever is in
     front of it. Masked pixels show nothing.
 
-    Args:
-        views: training views; at least one.
-        points: (P, 3) of the scene, world frame; P >= 1.
-        count: roughly the number of points before those near the cloud are left out, 1 or more.
-
-    Returns:
-        At most `count` points, none if photos show none. Normals point to the cameras' mean; a scale is half the
-        distance between neighbours.
-
-    Raises:
-        ValueError: `count` is below 1.
+    Takes points (P, 3) of the scene, world frame, and returns at most `count`, none if photos show none. Normals point
+    to the cameras' mean; a scale is half the distance between neighbours.
     """
     if count < 1:
         raise ValueError(f"count: expected at least 1, got {count}")

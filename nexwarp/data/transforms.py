@@ -48,35 +48,19 @@ JUDGED_PHOTOS, JUDGED_POINTS = 5, 5000
 
 @dataclass(frozen=True)
 class _Frames:
-    """The content of a JSON file.
-
-    Attributes:
-        file: the file.
-        data: its keys.
-        photos: its photos that exist, sorted by name.
-        held_out: names of the photos of ScanNet++'s `test_frames`.
-        missing: names of the photos that do not exist.
-        to_original: (4, 4) float64 similarity from the file's world frame to the original one.
-        follow_links: whether files may lie behind links that leave the scene's folder.
-    """
+    """The content of a JSON file."""
 
     file: Path
     data: JsonObject
-    photos: list[Photo]
-    held_out: set[str]
-    missing: list[str]
-    to_original: np.ndarray
-    follow_links: bool
+    photos: list[Photo]  # that exist, sorted by name
+    held_out: set[str]  # names of the photos of ScanNet++'s `test_frames`
+    missing: list[str]  # names of the photos that do not exist
+    to_original: np.ndarray  # (4, 4) float64 similarity from the file's world frame to the original one
+    follow_links: bool  # whether files may lie behind links that leave the scene's folder
 
 
 def read_nerfstudio(path: Path, images: str, follow_links: bool = False, skip_missing: bool = False) -> Capture:
-    """Read `transforms.json` of a scene.
-
-    Args:
-        path: folder of the scene.
-        images: folder of the photos that replaces "images" in the file.
-        follow_links: see `SceneSource`.
-        skip_missing: see `SceneSource`.
+    """Read `transforms.json` of the scene in `path`; `images` replaces "images" in the file.
 
     Raises:
         FileNotFoundError: a photo, a mask or the points that the file names do not exist.
@@ -91,17 +75,15 @@ def read_nerfstudio(path: Path, images: str, follow_links: bool = False, skip_mi
 def read_blender(path: Path, images: str, follow_links: bool = False, skip_missing: bool = False) -> Capture:
     """Read transforms_train.json and transforms_test.json of a Blender scene; without the latter, transforms_val.json.
 
-    Points are those of `ply_file_path`, or those of `points3d.ply` beside the JSON file if it exists. Arguments and
-    errors are those of `read_nerfstudio`.
+    Points are those of `ply_file_path`, or those of `points3d.ply` beside the JSON file if it exists.
     """
     train_file = path / BLENDER_FILES["train"]
     if not train_file.is_file():
         raise FileNotFoundError(f"{path}: expected {train_file.name} of a Blender scene, found none")
     train = _read_frames(train_file, images, follow_links, skip_missing)
     cloud = _points(train, BLENDER_POINTS)
-    file = next(
-        (path / BLENDER_FILES[part] for part in ("test", "val") if (path / BLENDER_FILES[part]).is_file()), None
-    )
+    others = (path / BLENDER_FILES[part] for part in ("test", "val"))
+    file = next((other for other in others if other.is_file()), None)
     if file is None:
         test = frozenset(train.held_out) or None
         return Capture.of(train_file, train.photos, cloud, test=test, background=WHITE)

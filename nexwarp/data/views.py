@@ -80,17 +80,11 @@ default_collate_fn_map[View] = _collate
 
 @dataclass(frozen=True)
 class PlannedView:
-    """A view before its pixels are read.
+    """A view before its pixels are read."""
 
-    Attributes:
-        photo: the photo, or a face of it if it is a panorama.
-        size: width and height of its file in pixels.
-        target: intrinsics after undistortion, before the reduction.
-    """
-
-    photo: Photo
-    size: tuple[int, int]
-    target: Intrinsics
+    photo: Photo  # or a face of it if it is a panorama
+    size: tuple[int, int]  # width and height of its file in pixels
+    target: Intrinsics  # after undistortion, before the reduction
 
 
 class ViewReader:
@@ -107,13 +101,7 @@ class ViewReader:
         self._maps, self._lock = lru_cache(KEPT_MAPS)(undistortion), Lock()
 
     def plan(self, photo: Photo) -> list[PlannedView]:
-        """Read the header of a photo and check it against its lens; return one view, or six for a panorama.
-
-        Raises:
-            FileNotFoundError: the photo does not exist.
-            ValueError: the photo or mask cannot be decoded or has another shape than its camera, or the camera is
-                invalid.
-        """
+        """Read the header of a photo and check it against its lens; return one view, or six for a panorama."""
         size = width, height = image_size(photo.file)
         lens = photo.lens
         # Tolerance: the size of a reduced image, as in a folder images_4, is rounded by up to one pixel.
@@ -143,11 +131,7 @@ class ViewReader:
         return [PlannedView(_face(photo, face), size, target) for face in FACES]
 
     def read(self, plan: PlannedView, near: float, origin: tuple[float, float, float]) -> View:
-        """Read, undistort and reduce a photo; `near` and `origin` are those of its camera.
-
-        Raises:
-            ValueError: the photo or mask cannot be decoded, the mask is empty, or the camera is invalid.
-        """
+        """Read, undistort and reduce a photo; `near` and `origin` are those of its camera."""
         photo = plan.photo
         image, alpha, mask = self._pixels(plan)
         if mask is not None and mask.all():

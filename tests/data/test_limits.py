@@ -22,6 +22,7 @@ from nexwarp.data import load_scene
 from nexwarp.data.colmap import read_model
 from nexwarp.data.images import read_image, read_mask
 from nexwarp.data.lens import pycolmap_module
+from nexwarp.io import json_files
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import parse_json
 from nexwarp.model.model_file import load, save_model
@@ -304,18 +305,19 @@ def test_a_models_metadata_is_bounded(tmp_path):
         load(file)
 
 
-def test_json_is_bounded():
+def test_json_is_bounded(monkeypatch):
     assert parse_json("x", b'{"a": [1, "[[[\\"[[["]}') == {"a": [1, '[[["[[[']}
     assert parse_json("x", b"[" * 64 + b"]" * 64) is not None
     for text in (b"[" * 65 + b"]" * 65, b"[" * 10**6, b'{"a":' * 10**5, b'["", ' * 65):
         with pytest.raises(ValueError, match="x: expected JSON of at most 64 levels, got one nested too deeply"):
             parse_json("x", text)
-    with pytest.raises(ValueError, match="x: expected at most 10 bytes of JSON, got 11"):
-        parse_json("x", b" " * 11, max_bytes=10)
     with pytest.raises(ValueError, match="x: expected JSON, could not parse it"):
         parse_json("x", b'["' + b'\\"' * 10**6)  # no end to the text: found in one look at it
     with pytest.raises(ValueError, match="NaN is no JSON number"):
         parse_json("x", b"[NaN]", finite=True)
+    monkeypatch.setattr(json_files, "MAX_BYTES", 10)
+    with pytest.raises(ValueError, match="x: expected at most 10 bytes of JSON, got 11"):
+        parse_json("x", b" " * 11)
 
 
 def test_paths_and_cameras_with_absurd_numbers(tmp_path):

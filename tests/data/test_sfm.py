@@ -22,9 +22,9 @@ from nexwarp.data.capture import Capture
 from nexwarp.data.colmap import read_model
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.sfm import SfmOptions, reconstruct
-from nexwarp.data.sfm.pairs import components, exhaustive_pairs, sequential_pairs
 from nexwarp.data.sfm.photos import affordable_threads, list_photos
-from nexwarp.data.sfm.report import Overlaps, advise, left_out
+from nexwarp.data.sfm.report import Overlaps, advise, components, left_out
+from nexwarp.data.sfm.stages import exhaustive_pairs, sequential_pairs
 from nexwarp.errors import OutOfMemoryError, SceneError, StorageError
 from tests.cli.support import refused, snapshot
 from tests.subprocesses import python_path
@@ -433,7 +433,8 @@ def test_files_of_others_are_not_overwritten(change, made, photos, tmp_path, cap
 
 STAND_IN = """
 import os, shutil
-from nexwarp.data.sfm import child, stages
+from nexwarp.data.sfm import stages
+from nexwarp.data.sfm.process import work
 from nexwarp.data.sfm.report import SfmReport
 def run(self, names):
     self.observe("features", 0, 1)
@@ -443,7 +444,7 @@ def run(self, names):
     {fault}
     return SfmReport(1, [], {{}}, 0, 0.0, 0.0, [], [], [], 0, 0, "exhaustive", {{}}, [], [], [])
 stages.Stages.run = run
-child.main()
+work()
 """
 
 

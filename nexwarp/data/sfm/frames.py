@@ -1,7 +1,7 @@
 """Choice of sharp, distinct frames from a video, as photos for a reconstruction."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,21 +24,13 @@ JPEG_QUALITY = 97
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """The frames of a video that become photos, and those that were left out. Numbers count from 0.
+    """The frames of a video that become photos, and those that were left out. Numbers count from 0."""
 
-    Attributes:
-        frames: number of frames in the video.
-        seconds: length of the video.
-        chosen: numbers of the chosen frames, ascending.
-        blurred: numbers of frames that were the sharpest of their part of the video and still blurred.
-        duplicates: numbers of frames that show nearly the same as the chosen frame before.
-    """
-
-    frames: int
-    seconds: float
-    chosen: list[int]
-    blurred: list[int]
-    duplicates: list[int]
+    frames: int  # number of frames in the video
+    seconds: float  # length of the video
+    chosen: list[int]  # ascending
+    blurred: list[int]  # frames that were the sharpest of their part of the video and still blurred
+    duplicates: list[int]  # frames that show nearly the same as the chosen frame before
 
     def rows(self) -> dict[str, str]:
         """The figures as rows of a table: name -> text."""
@@ -90,32 +82,28 @@ def take_frames(
     """Divide a video into `count` parts of equal length, and write the sharpest frame of each into a folder.
 
     A frame is left out if it is much less sharp than its neighbours, or nearly the same as the one before. The files
-    are frame_NUMBER.jpg. The video is decoded twice, so that no frame is kept in memory.
-
-    Args:
-        path: the video.
-        count: number of parts, at least 3; a video with fewer frames has a part for each frame.
-        folder: folder to write.
-        observe: called with the stage's name, the number of frames read and their total, which is not known before.
+    are frame_NUMBER.jpg. The video is decoded twice, so that no frame is kept in memory. `observe` is called with the
+    stage's name, the number of frames read and their total, which is not known before.
 
     Raises:
-        SettingError: `count` is less than 3, or PyAV is missing.
         FormatError: the file is no video, or is damaged.
         SceneError: fewer than 3 frames are left.
     """
-    check_frames(path, count)
     scores: list[float] = []
     seconds = 0.0
     for frame in read_frames(path):
         scores.append(sharpness(frame_luma(frame, SIDE)))
         seconds = max(seconds, frame.time or 0.0)
         observe("reading the video", len(scores), len(scores))
-    candidates = [max(part, key=scores.__getitem__) for part in _parts(len(scores), count)]
-    blurred = [
-        index
-        for place, index in enumerate(candidates)
-        if scores[index] < BLURRED * np.median([scores[i] for i in _around(candidates, place)])
-    ]
+    total = len(scores)
+    count = min(count, total)
+    parts = [range(total * k // count, total * (k + 1) // count) for k in range(count)]
+    candidates = [max(part, key=scores.__getitem__) for part in parts]
+    blurred = []
+    for place, index in enumerate(candidates):
+        around = candidates[max(place - NEIGHBOURS, 0) : place + NEIGHBOURS + 1]
+        if scores[index] < BLURRED * np.median([scores[i] for i in around]):
+            blurred.append(index)
     sharp = [index for index in candidates if index not in blurred]
     chosen: list[int] = []
     before: np.ndarray | None = None
@@ -135,14 +123,3 @@ def take_frames(
             "and differ"
         )
     return FrameChoice(len(scores), seconds, chosen, blurred, [index for index in sharp if index not in chosen])
-
-
-def _parts(total: int, count: int) -> list[range]:
-    """Divide range(total) into at most `count` parts of equal length."""
-    count = min(count, total)
-    return [range(total * k // count, total * (k + 1) // count) for k in range(count)]
-
-
-def _around(items: Sequence[int], place: int) -> Sequence[int]:
-    """Return the items around a place."""
-    return items[max(place - NEIGHBOURS, 0) : place + NEIGHBOURS + 1]

@@ -19,7 +19,7 @@ from nexwarp.data.images import downscale_image, image_size, read_image
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.scene import GIB, SHARE
 from nexwarp.data.sfm.frames import BLURRED, SIDE, STILL, THUMBNAIL, motion, reduced_luma, sharpness
-from nexwarp.data.sfm.options import SfmOptions
+from nexwarp.data.sfm.report import SfmOptions
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.machine import available_memory
 
@@ -36,31 +36,20 @@ MOST_DECODED = 2 * GIB  # memory of the photos that are decoded at once, if ther
 
 @dataclass(frozen=True)
 class InputPhoto:
-    """A photo before reconstruction, without a pose.
+    """A photo before reconstruction, without a pose."""
 
-    Attributes:
-        name: path below the photos' folder, with "/" as separator.
-        size: width and height in pixels; EXIF orientation is not applied.
-        device: make and model of the camera from EXIF, empty if absent.
-        focal: focal length in pixels from EXIF; None if absent.
-        sharpness: as of `frames.sharpness`.
-        thumbnail: (h, w) uint8 brightness, reduced to 160 pixels.
-    """
-
-    name: str
-    size: tuple[int, int]
-    device: tuple[str, str]
-    focal: float | None
-    sharpness: float
-    thumbnail: np.ndarray
+    name: str  # path below the photos' folder, with "/" as separator
+    size: tuple[int, int]  # width and height in pixels; EXIF orientation is not applied
+    device: tuple[str, str]  # make and model of the camera from EXIF, empty if absent
+    focal: float | None  # in pixels from EXIF; None if absent
+    sharpness: float  # as of `frames.sharpness`
+    thumbnail: np.ndarray  # (h, w) uint8 brightness, reduced to 160 pixels
 
 
 def list_photos(folder: Path) -> list[str]:
     """Names of the photos below `folder`, without hidden files, in numeric order (IMG_9 before IMG_10).
 
-    Raises:
-        FileNotFoundError: no such folder.
-        ValueError: it has fewer than 3 photos, or one that is a link out of it or has a name that no scene can have.
+    ValueError: it has fewer than 3 photos, or one that is a link out of it or has a name that no scene can have.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder, expected one with photos")
@@ -107,14 +96,7 @@ def affordable_threads(folder: Path, names: Sequence[str], options: SfmOptions) 
 def read_photos(folder: Path, names: Sequence[str], threads: int, done: Callable[[int], None]) -> list[InputPhoto]:
     """Decode every photo, so that a damaged one is reported before the reconstruction, and read its EXIF.
 
-    Args:
-        folder: folder of the photos.
-        names: their names below it.
-        threads: number of photos that are decoded at once.
-        done: called with the number of photos that were read.
-
-    Raises:
-        ValueError: a photo cannot be decoded.
+    `threads` photos are decoded at once; `done` is called with the number of photos that were read.
     """
     photos: list[InputPhoto] = []
     with ThreadPoolExecutor(threads) as pool:  # decoding releases the GIL
@@ -169,16 +151,7 @@ def _device(path: Path) -> tuple[str, str]:
 
 
 def camera_groups(folder: Path, photos: Sequence[InputPhoto], cameras: str) -> list[list[InputPhoto]]:
-    """Group photos that share a camera.
-
-    Args:
-        folder: folder of the photos, for messages.
-        photos: the photos.
-        cameras: `SfmOptions.cameras`.
-
-    Raises:
-        ValueError: photos of one group differ in size.
-    """
+    """Group photos that share a camera by `SfmOptions.cameras`; ValueError where photos of one differ in size."""
     keys: dict[str, Callable[[InputPhoto], object]] = {
         "auto": lambda p: (p.size, p.device, p.focal and round(p.focal)),
         "single": lambda p: (),
@@ -191,9 +164,10 @@ def camera_groups(folder: Path, photos: Sequence[InputPhoto], cameras: str) -> l
     for group in groups.values():
         for photo in group:
             if photo.size != group[0].size:
+                one, other = (f"{p.size[0]}x{p.size[1]} ({p.name})" for p in (group[0], photo))
                 raise ValueError(
-                    f"{folder}: photos of one camera must have one size, got {_text(group[0].size)} ({group[0].name}) "
-                    f"and {_text(photo.size)} ({photo.name}); expected --cameras auto or image rather than {cameras}"
+                    f"{folder}: photos of one camera must have one size, got {one} and {other}; "
+                    f"expected --cameras auto or image rather than {cameras}"
                 )
     return list(groups.values())
 
@@ -203,7 +177,3 @@ def camera_model(group: Sequence[InputPhoto], options: SfmOptions) -> str:
     if options.camera_model != "auto":
         return options.camera_model.upper()
     return "OPENCV" if len(group) >= MANY else "SIMPLE_RADIAL"
-
-
-def _text(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"

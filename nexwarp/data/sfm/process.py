@@ -1,4 +1,4 @@
-"""From a video or a folder of photos to a scene. The work is done by a process of its own (`child`).
+"""From a video or a folder of photos to a scene. The work is done by a process of its own (`work`).
 
 An abort in the libraries that decode and reconstruct ends that process alone; this one claims the scene's name, shows
 the progress, and puts the finished scene in its place.
@@ -13,28 +13,28 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from signal import Signals
 from subprocess import PIPE
-from threading import Thread
 from typing import Any
 from zlib import crc32
 
 from filelock import FileLock, Timeout
 
 from nexwarp import errors
-from nexwarp.data.sfm.frames import FrameChoice, check_frames
-from nexwarp.data.sfm.options import SfmOptions
+from nexwarp.data.sfm.frames import FrameChoice, check_frames, take_frames
 from nexwarp.data.sfm.photos import list_photos
-from nexwarp.data.sfm.report import EstimatedCamera, SfmReport
-from nexwarp.data.sfm.stages import PYCOLMAP, Observer
-from nexwarp.errors import SceneError, StorageError
+from nexwarp.data.sfm.report import EstimatedCamera, SfmOptions, SfmReport
+from nexwarp.data.sfm.stages import PYCOLMAP, Observer, Stages
+from nexwarp.errors import NexwarpError, SceneError, StorageError
 from nexwarp.io.files import make_folders, one_line, remove_empty
-from nexwarp.io.json_files import READ_ERRORS, Json, JsonObject, read_object
+from nexwarp.io.json_files import READ_ERRORS, Json, JsonObject, read_object, write_json
+from nexwarp.machine import needed_memory
 
 REPORT_FILE = "sfm.json"
 PARTS = ("images", "sparse", REPORT_FILE)  # of a scene
@@ -42,7 +42,7 @@ FRAMES = 120  # parts of a video, of which each gives a photo
 LOCK_FILE, REPLACED = "lock", "replaced"  # in the folder that claims a name
 MAX_STEM = 40  # characters of the scene's name in that folder's name
 
-CHILD = (sys.executable, "-c", "from nexwarp.data.sfm.child import main; main()")
+CHILD = (sys.executable, "-c", "from nexwarp.data.sfm.process import work; work()")
 LAST_LINES = 200  # of what a process writes to stderr, in which the reason of its end is searched
 FULL = re.compile(r"No space left|disk is full|File too large|File size limit|disk I/O error", re.I)
 REASON = re.compile(f"Check failed|what\\(\\):|{FULL.pattern}", re.I)
@@ -55,23 +55,14 @@ RAISED = ("SceneError", "FormatError", "SettingError", "OutOfMemoryError")
 
 @dataclass(frozen=True)
 class Order:
-    """What the other process is to do.
+    """What the other process is to do."""
 
-    Attributes:
-        source: the video, or the folder of the photos.
-        photos: names of the photos; none for a video.
-        folder: folder to work in; the scene is made in its subfolder scene/.
-        frames: number of parts of a video.
-        options: those of `SfmOptions`.
-        video: the video's identity; None for photos.
-    """
-
-    source: str
-    photos: list[str]
-    folder: str
-    frames: int
-    options: JsonObject
-    video: JsonObject | None
+    source: str  # the video, or the folder of the photos
+    photos: list[str]  # names of the photos; none for a video
+    folder: str  # to work in; the scene is made in its subfolder scene/
+    frames: int  # number of parts of a video
+    options: JsonObject  # of `SfmOptions`
+    video: JsonObject | None  # the video's identity; None for photos
 
 
 def process(
@@ -192,7 +183,7 @@ def _in_child(order: Order, scene: Path, observe: Observer) -> SfmReport:
     ) as child:
         assert child.stdin is not None and child.stdout is not None and child.stderr is not None
         last: deque[bytes] = deque(maxlen=LAST_LINES)
-        listener = Thread(target=last.extend, args=(child.stderr,), daemon=True)
+        listener = threading.Thread(target=last.extend, args=(child.stderr,), daemon=True)
         listener.start()
         answer: Any = {}
         try:
@@ -251,6 +242,67 @@ def _end_of(source: str, code: int, words: str) -> str:
     end = f"signal {Signals(-code).name}" if code < 0 else f"exit code {code}"
     hint = "; it may have had too little memory" if code == -KILLED else ""
     return f"{source}: {PYCOLMAP}: its process ended with {end} ({one_line(reason)}){hint}"
+
+
+def work() -> None:
+    """Do what stdin orders, once."""
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # what libraries print is no answer
+    order = Order(**json.loads(sys.stdin.readline()))
+    threading.Thread(target=_end_with_parent, args=(Path(order.folder),), daemon=True).start()
+
+    def answer(content: dict[str, object]) -> None:
+        print(json.dumps(content), file=answers, flush=True)
+
+    try:
+        answer({"report": _make(order, lambda *progress: answer({"stage": progress}))})
+    except Exception as error:
+        kind, text = type(error).__name__, str(error)
+        if needed_memory(error) is not None:
+            kind = "OutOfMemoryError"
+        elif isinstance(error, RuntimeError):  # pycolmap's
+            kind, text = "ValueError", f"{order.source}: {PYCOLMAP}: {one_line(error)}"
+        elif not isinstance(error, (ValueError, OSError)):
+            text = f"{kind}: {text}"
+        elif isinstance(error, ValueError) and not isinstance(error, NexwarpError):
+            kind = "ValueError"
+        number = error.errno if isinstance(error, OSError) else None
+        answer({"error": kind, "text": text or kind, "number": number})
+    os._exit(0)
+
+
+def _end_with_parent(folder: Path) -> None:
+    """Wait for the end of stdin, which is that of the other process; then delete the folder and end."""
+    sys.stdin.read()
+    for _ in range(3):  # other threads may still write
+        shutil.rmtree(folder, ignore_errors=True)
+    with suppress(OSError):
+        (folder.parent / LOCK_FILE).unlink()
+        folder.parent.rmdir()
+    os._exit(1)
+
+
+def _make(order: Order, observe: Observer) -> dict[str, object]:
+    """Make folder/scene of the photos, or of frames of the video, and return the report."""
+    source, folder = Path(order.source), Path(order.folder)
+    options = SfmOptions(**order.options)  # type: ignore[arg-type]  # checked before
+    names, choice = order.photos, None
+    if order.video is not None:
+        photos = folder / "frames"
+        photos.mkdir()
+        choice = take_frames(source, order.frames, photos, observe)
+        source, names = photos, sorted(file.name for file in photos.iterdir())
+        if options.matching == "auto":
+            options = replace(options, matching="sequential")
+    report = replace(Stages(source, folder, options, observe).run(names), frames=choice)
+    if choice is not None:  # it names those that were left out
+        report = replace(report, blurred=[], repeated=[])
+    scene = folder / "scene"
+    content = asdict(report)
+    files = {file.relative_to(scene).as_posix(): file_facts(file) for file in scene.rglob("*") if file.is_file()}
+    extra = {"options": asdict(options), "video": order.video, "files": files}
+    write_json(scene / REPORT_FILE, content | extra)
+    return content
 
 
 # The scene

@@ -1,95 +1,101 @@
-"""The report of a reconstruction: registered photos, reasons for the others, advice."""
+"""The settings and the report of a reconstruction: registered photos, reasons for the others, advice."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal, get_args
+
+import tyro
 
 from nexwarp.data.sfm.frames import FrameChoice
-from nexwarp.data.sfm.pairs import components
 
+Cameras = Literal["auto", "single", "folder", "image"]
+CameraModel = Literal[
+    "auto", "simple_pinhole", "pinhole", "simple_radial", "radial", "opencv", "full_opencv", "opencv_fisheye"
+]
+Matching = Literal["auto", "exhaustive", "sequential"]
+
+EXHAUSTIVE_UP_TO = 150  # photos: 11,175 pairs, a quarter of an hour on two cores
 FEW_FEATURES = 500  # a photo
 GOOD_SHARE = 0.9  # share of registered photos below which the report gives advice
 LISTED = 8  # entries of a list in the report
 
 
 @dataclass(frozen=True)
+class SfmOptions:
+    """Settings of structure from motion."""
+
+    cameras: Cameras = "auto"
+    """Photos that share a camera: equal size, lens and EXIF focal length (auto), all, of a folder, or none (image)."""
+    camera_model: CameraModel = "auto"
+    """COLMAP's lens model of the photos; auto is opencv for a camera of 5 photos or more, else simple_radial."""
+    matching: Matching = "auto"
+    """Compare every pair (exhaustive) or neighbours by name (sequential); auto is exhaustive up to 150 photos."""
+    overlap: Annotated[int, tyro.conf.arg(metavar="N")] = 10
+    """Successors that a photo is compared with in sequential matching, in addition to those at 2, 4, 8, ... photos."""
+    max_features: Annotated[int, tyro.conf.arg(metavar="N")] = 8192
+    """SIFT features per photo; fewer are faster, more give more points."""
+    max_image_size: Annotated[int, tyro.conf.arg(metavar="PIXELS")] = 3200
+    """Longer side for feature extraction; larger photos are reduced for this step only."""
+    threads: Annotated[int | None, tyro.conf.arg(metavar="N", help_behavior_hint="(default: one a core)")] = None
+    """CPU threads; with 1 thread the same photos give the same scene, bit for bit."""
+    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
+    """Random seed."""
+
+    def check(self) -> None:
+        """Raise ValueError, naming the option, when a value is out of range or unknown."""
+        for name, choices in (("cameras", Cameras), ("camera_model", CameraModel), ("matching", Matching)):
+            if getattr(self, name) not in get_args(choices):
+                expected = ", ".join(get_args(choices))
+                raise ValueError(f"{name}: expected one of {expected}, got {getattr(self, name)!r}")
+        for name, low in (("overlap", 1), ("max_features", 64), ("max_image_size", 64), ("threads", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if value is not None and not low <= value < 2**31:
+                raise ValueError(f"{name}: expected at least {low}, got {value}")
+
+
+@dataclass(frozen=True)
 class Overlaps:
-    """Features and matches of the photos.
+    """Features and matches of the photos."""
 
-    Attributes:
-        features: number of features of each photo, by name.
-        inliers: number of geometrically verified matches of a pair, by names; only pairs with at least one.
-        pairs: number of compared pairs.
-        sequential: whether only neighbours were compared.
-    """
-
-    features: dict[str, int]
-    inliers: dict[tuple[str, str], int]
-    pairs: int
-    sequential: bool
+    features: dict[str, int]  # number of features of each photo, by name
+    inliers: dict[tuple[str, str], int]  # verified matches of a pair, by names; only pairs with at least one
+    pairs: int  # number of compared pairs
+    sequential: bool  # whether only neighbours were compared
 
 
 @dataclass(frozen=True)
 class EstimatedCamera:
-    """A camera of the photos before undistortion.
+    """A camera of the photos before undistortion."""
 
-    Attributes:
-        model: COLMAP's name of its model.
-        params: parameters in COLMAP's order, pixels.
-        width: width of its photos, pixels.
-        height: height of its photos, pixels.
-        photos: number of registered photos that share it.
-        exif_focal: whether EXIF gave its initial focal length.
-    """
-
-    model: str
-    params: list[float]
-    width: int
+    model: str  # COLMAP's name
+    params: list[float]  # in COLMAP's order, pixels
+    width: int  # of its photos, pixels
     height: int
-    photos: int
-    exif_focal: bool
+    photos: int  # number of registered photos that share it
+    exif_focal: bool  # whether EXIF gave its initial focal length
 
 
 @dataclass(frozen=True)
 class SfmReport:
-    """The result of a reconstruction.
+    """The result of a reconstruction."""
 
-    Attributes:
-        photos: number of given photos.
-        registered: names of the photos with an estimated pose, in the scene's order.
-        left_out: name -> reason, for each photo without a pose.
-        points: number of 3D points.
-        mean_track_length: mean number of photos that see a point.
-        mean_reprojection_error: mean over the points, in pixels of the given photos.
-        models: number of photos of each model that was found, largest first; the scene is the first one.
-        cameras: the cameras of the photos before undistortion.
-        sizes: distinct widths and heights of the undistorted photos.
-        pairs: number of compared pairs.
-        matched_pairs: number of compared pairs that overlap.
-        matching: "exhaustive" or "sequential".
-        seconds: wall-clock time of each stage.
-        advice: how to get more photos registered; empty if 90 % or more are registered.
-        blurred: names of photos that are much less sharp than the others; they are used all the same.
-        repeated: names of photos that show nearly the same as the one before; they are used all the same.
-        frames: the frames of a video; None for photos.
-    """
-
-    photos: int
-    registered: list[str]
-    left_out: dict[str, str]
-    points: int
-    mean_track_length: float
-    mean_reprojection_error: float
-    models: list[int]
+    photos: int  # number of given photos
+    registered: list[str]  # names of the photos with an estimated pose, in the scene's order
+    left_out: dict[str, str]  # name -> reason, for each photo without a pose
+    points: int  # number of 3D points
+    mean_track_length: float  # mean number of photos that see a point
+    mean_reprojection_error: float  # mean over the points, in pixels of the given photos
+    models: list[int]  # number of photos of each model that was found, largest first; the scene is the first one
     cameras: list[EstimatedCamera]
-    sizes: list[tuple[int, int]]
-    pairs: int
-    matched_pairs: int
-    matching: str
-    seconds: dict[str, float]
-    advice: list[str]
-    blurred: list[str]
-    repeated: list[str]
-    frames: FrameChoice | None = None
+    sizes: list[tuple[int, int]]  # distinct widths and heights of the undistorted photos
+    pairs: int  # number of compared pairs
+    matched_pairs: int  # number of compared pairs that overlap
+    matching: str  # "exhaustive" or "sequential"
+    seconds: dict[str, float]  # wall-clock time of each stage
+    advice: list[str]  # how to get more photos registered; empty if 90 % or more are registered
+    blurred: list[str]  # names of photos that are much less sharp than the others; they are used all the same
+    repeated: list[str]  # names of photos that show nearly the same as the one before; they are used all the same
+    frames: FrameChoice | None = None  # the frames of a video; None for photos
 
     def rows(self) -> dict[str, str]:
         """The figures as rows of a table: name -> text."""
@@ -180,3 +186,16 @@ def advise(overlaps: Overlaps, registered: int) -> list[str]:
             "--cameras image if the zoom changed"
         )
     return advice
+
+
+def components(nodes: Iterable[str], edges: Iterable[tuple[str, str]]) -> list[set[str]]:
+    """Return the connected components of a graph, largest first."""
+    group = {node: {node} for node in nodes}
+    for one, other in edges:
+        if group[one] is not group[other]:
+            small, large = sorted((group[one], group[other]), key=len)
+            large |= small
+            for node in small:
+                group[node] = large
+    unique = {id(members): members for members in group.values()}.values()
+    return sorted(unique, key=lambda members: (-len(members), min(members)))

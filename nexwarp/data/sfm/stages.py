@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import combinations
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -13,16 +15,16 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from nexwarp.data.colmap import read_model
 from nexwarp.data.images import read_image
 from nexwarp.data.lens import pycolmap_module
-from nexwarp.data.sfm.options import EXHAUSTIVE_UP_TO, SfmOptions
-from nexwarp.data.sfm.pairs import exhaustive_pairs, sequential_pairs
 from nexwarp.data.sfm.photos import InputPhoto, affordable_threads, camera_groups, camera_model, judged, read_photos
-from nexwarp.data.sfm.report import EstimatedCamera, Overlaps, SfmReport, advise, left_out
+from nexwarp.data.sfm.report import EstimatedCamera, Overlaps, SfmOptions, SfmReport, advise, left_out
 from nexwarp.io.files import one_line
 
 if TYPE_CHECKING:
     import pycolmap
 
 JPEG_QUALITY = 95  # of undistorted JPEG photos; other formats are lossless
+EXHAUSTIVE_UP_TO = 150  # photos: 11,175 pairs, a quarter of an hour on two cores
+TILE = 16  # photos; the pairs of two tiles are matched together, so that their features stay in memory
 MATCH_BLOCK = 16  # pairs that are matched together
 MIN_MODEL = 3  # photos of a model
 POLL_SECONDS = 0.2
@@ -113,8 +115,12 @@ class Stages:
         """Enter photos and cameras in the database, in a fixed order, since the mapper's result depends on it."""
         with open_database(self.database):  # creates the file
             pass
+        pycolmap = pycolmap_module()
+        reader, single = pycolmap.ImageReaderOptions(), pycolmap.CameraMode.SINGLE
         for group in groups:
-            self._import_group([photo.name for photo in group], camera_model(group, self.options))
+            names = [photo.name for photo in group]
+            reader.camera_model = camera_model(group, self.options)
+            run_stage("features", partial(pycolmap.import_images, self.database, self.photos, single, names, reader))
         by_name = {photo.name: group for group in groups for photo in group}
         with open_database(self.database) as database:
             camera_of = {image.camera_id: by_name[image.name] for image in database.read_all_images()}
@@ -125,16 +131,6 @@ class Stages:
                         camera.params[index] = median(focals)
                 camera.has_prior_focal_length = bool(focals)
                 database.update_camera(camera)
-
-    def _import_group(self, names: list[str], model: str) -> None:
-        pycolmap = pycolmap_module()
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = model
-        single = pycolmap.CameraMode.SINGLE
-        run_stage(
-            "features",
-            lambda: pycolmap.import_images(self.database, self.photos, single, names, reader),
-        )
 
     def _extract(self, names: Sequence[str], done: Callable[[int], None]) -> None:
         pycolmap = pycolmap_module()
@@ -274,6 +270,30 @@ class Stages:
                 if shape != (photo.lens.height, photo.lens.width):
                     raise ValueError(f"{photo.name}: {PYCOLMAP}: it wrote {shape[1]}x{shape[0]} pixels")
                 done(count)
+
+
+def exhaustive_pairs(count: int) -> list[tuple[int, int]]:
+    """Return all pairs (i, j), i < j, of `count` photos, ordered by tiles."""
+    return sorted(combinations(range(count), 2), key=lambda pair: (pair[0] // TILE, pair[1] // TILE, *pair))
+
+
+def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
+    """Return pairs (i, j), i < j, of `count` photos in sequence.
+
+    Each photo is paired with its next `overlap` successors and with the successors at offsets 2, 4, 8, ...,
+    2^(overlap - 1). The first `overlap` offsets wrap around from the last photo to the first, since a capture around an
+    object ends where it began.
+    """
+    offsets = {*range(1, overlap + 1), *(2**k for k in range(overlap) if 2**k < count)}
+    pairs = set()
+    for i in range(count):
+        for offset in offsets:
+            # Only the first `overlap` offsets wrap around.
+            if i + offset < count or offset <= overlap:
+                j = (i + offset) % count
+                if i != j:
+                    pairs.add((min(i, j), max(i, j)))
+    return sorted(pairs)
 
 
 def _names(model: "pycolmap.Reconstruction") -> list[str]:
