@@ -92,19 +92,13 @@ class Layout:
         return (self.boxes[:, 2] > self.boxes[:, 0]).nonzero()[:, 0]
 
     def texels(self, ids: torch.Tensor, local: torch.Tensor) -> torch.Tensor:
-        """Return places (..., 2) in the atlas, column and row, of coordinates (..., 2) on surfels (...).
-
-        Whole numbers are centres of texels; the coordinates are in units of the scales.
-        """
+        """Return columns and rows (..., 2), whole at centres of texels, of coordinates (..., 2) [scales] on surfels."""
         boxes, rects = self.boxes[ids], self.rects[ids].to(local)
         share = (local - boxes[..., :2]) / (boxes[..., 2:] - boxes[..., :2]).clamp_min(1e-12)
         return rects[..., :2] + share.clamp(0, 1) * (rects[..., 2:] - 1)
 
     def centres(self) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-        """Yield the texels, about a million at a time, as an atlas has up to 16 million.
-
-        Places (M, 2) int64, column and row; surfels (M,) int64; coordinates (M, 2) on them.
-        """
+        """Yield columns and rows of about a million texels (M, 2), their surfels (M,), coordinates on these (M, 2)."""
         textured = self.textured()
         part = self.rects[textured, 2:].long().prod(1).cumsum(0) // TEXELS_AT_A_TIME
         for members in textured.split(part.unique_consecutive(return_counts=True)[1].tolist()):
@@ -255,13 +249,10 @@ def lay_out(boxes: torch.Tensor, pixels: torch.Tensor, *, fewest: int = 2) -> La
 
 
 def _pack(sizes: torch.Tensor, width: int) -> tuple[torch.Tensor, int]:
-    """Place rectangles (M, 2) on shelves, tallest first, below a first row that holds the texel of untextured surfels.
-
-    Returns left and top (M, 2) int32, and the height of the atlas, a multiple of 4.
-    """
+    """Return left and top (M, 2) of rectangles on shelves, tallest first, and the atlas' height, a multiple of 4."""
     order = torch.argsort(sizes[:, 1], descending=True, stable=True)
     places: list[tuple[int, int]] = []
-    left, top, tallest = 0, 1, 0
+    left, top, tallest = 0, 1, 0  # the first row holds the texel of untextured surfels
     for across, along in sizes[order].tolist():
         if left + across > width:
             left, top, tallest = 0, top + tallest, 0
@@ -282,10 +273,7 @@ def sample(atlas: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
 
 @torch.no_grad()
 def evaluate(model: Model, seen: Observations, layout: Layout) -> Baked:
-    """Bake the texture at the texels of a layout, seen from the surfels' mean directions.
-
-    What is added to a plain colour is weighted by the fraction of the surfel that is textured.
-    """
+    """Bake the texture, weighted by each surfel's textured share, at texels seen from the mean directions."""
     surfels, texture, options = model.surfels, model.texture, model.options
     atlas = surfels.means.new_zeros(layout.height, layout.width, 3)
     baked = Baked(model, surfels, seen, layout, atlas)

@@ -192,11 +192,11 @@ def _checked(path: str | os.PathLike[str], answer: Mapping[str, Any]) -> Any:
 class Pieces:
     """M Gaussians: whole surfels first, then pieces of split surfels."""
 
+    whole: int  # number of whole surfels
     ids: torch.Tensor  # (M,) int64, indices of the surfels
     offsets: torch.Tensor  # (M, 2) of the centres along the surfel's two axes, world units
     scales: torch.Tensor  # (M, 2) standard deviations along the two axes, world units
     opacities: torch.Tensor  # (M,)
-    whole: int  # number of whole surfels
 
 
 @torch.no_grad()
@@ -205,8 +205,7 @@ def split_large(
 ) -> Pieces:
     """Split surfels of which a scale is above `max_extent` of their distance to a camera. Gamma is taken as 1.
 
-    Takes centres (N, 3), standard deviations (N, 2) and opacities (N,). Returns the surfels that are small enough, in
-    order, then the pieces of the others; where these are very many, in coarser grids.
+    The surfels that are small enough come first, in order, then pieces of the others; very many, in coarser grids.
     """
     limit = means.new_full((len(means),), math.inf)
     for camera in cameras:
@@ -222,18 +221,19 @@ def split_large(
         most -= 1
         steps = wanted.clamp(max=most)
     whole = (steps == 0).all(dim=1)
-    ids = [whole.nonzero()[:, 0]]
-    offsets, sizes, alphas = [means.new_zeros(len(ids[0]), 2)], [scales[whole]], [opacities[whole]]
+    small = whole.nonzero()[:, 0]
+    parts = [(small, means.new_zeros(len(small), 2), scales[whole], opacities[whole])]
     large = (~whole).nonzero()[:, 0]
     kinds, kind = torch.unique(torch.cat([steps[large], level[large, None].long()], dim=1), dim=0, return_inverse=True)
     for index, (across, along, grade) in enumerate(kinds.tolist()):
         members = large[kind == index]
         grid, size, alpha = (x.to(means) for x in _grid(across, along, grade))
-        ids.append(members.repeat_interleave(len(grid)))
-        offsets.append((scales[members, None] * grid).flatten(0, 1))
-        sizes.append((scales[members, None] * size).expand(-1, len(grid), 2).flatten(0, 1))
-        alphas.append((peak[members, None] * LEVELS / grade * alpha).clamp(max=ALPHA_MAX).flatten())
-    return Pieces(torch.cat(ids), torch.cat(offsets), torch.cat(sizes), torch.cat(alphas), len(ids[0]))
+        offsets, sizes = scales[members, None] * grid, (scales[members, None] * size).expand(-1, len(grid), 2)
+        alphas = (peak[members, None] * LEVELS / grade * alpha).clamp(max=ALPHA_MAX)
+        ids = members.repeat_interleave(len(grid))
+        parts.append((ids, offsets.flatten(0, 1), sizes.flatten(0, 1), alphas.flatten()))
+    joined = [torch.cat(each) for each in zip(*parts, strict=True)]
+    return Pieces(len(small), *joined)
 
 
 def _reach(peak: torch.Tensor) -> torch.Tensor:
@@ -243,10 +243,7 @@ def _reach(peak: torch.Tensor) -> torch.Tensor:
 
 @lru_cache(4096)
 def _grid(across: int, along: int, level: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Fit `across` pieces on either side of the centre along x, `along` along y, to an opacity of `level` / `LEVELS`.
-
-    Returns centres (P, 2) and standard deviations (2,), in those of the surfel, and opacities (P,).
-    """
+    """Return centres (P, 2), sizes (2,) in those of the surfel, and opacities (P,) of 2n + 1 pieces along an axis."""
     peak = torch.tensor(level / LEVELS, dtype=torch.float64)
     reach = float(_reach(peak))
     spacing = [reach / n if n else 0.0 for n in (across, along)]

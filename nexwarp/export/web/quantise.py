@@ -31,10 +31,7 @@ def morton_order(means: np.ndarray) -> np.ndarray:
 
 
 def encode_chunks(values: np.ndarray, dtype: type, size: int = CHUNK) -> tuple[np.ndarray, np.ndarray]:
-    """Quantise (N, C) values, each column of each chunk of `size` rows with a range of its own.
-
-    Returns (N, C) codes, and (chunks, C, 2) float32: value of code 0 and difference between codes.
-    """
+    """Return codes of (N, C) values, and value of code 0 and step (chunks, C, 2) for each column of `size` rows."""
     if len(values) == 0:
         return np.zeros(values.shape, dtype), np.zeros((0, values.shape[1], 2), np.float32)
     starts = np.arange(0, len(values), size)
@@ -65,8 +62,7 @@ def encode_quats(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     A surfel looks the same after half turns about its axes, and after a quarter turn about z that swaps its axes. So
     w can be the largest component, and |z| at most sin(22.5 degrees): fewer values, finer steps.
-
-    Returns (N,) uint32 codes of x, y (11 bits each) and z (10 bits); and (N,) bool: whether the axes were swapped.
+    Returns codes (N,) of x, y (11 bits each) and z (10 bits), and whether the axes were swapped (N,).
     """
     w, x, y, z = straight = quats.astype(np.float64).T
     quarter = np.sqrt(0.5) * np.array([w - z, x + y, y - x, z + w])
@@ -92,10 +88,7 @@ def log_of(values: np.ndarray) -> np.ndarray:
 
 
 def encode_limits(limits: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Quantise detail limits (N, 2) logarithmically.
-
-    Returns (N, 2) uint16 codes, 0 for 0 and 65535 for NEVER; and (2,) float32, logarithm of code 1 and step of others.
-    """
+    """Return codes of logarithms of detail limits (N, 2), 0 for 0, 65535 for NEVER; that of code 1 and step (2,)."""
     known = (limits > 0) & (limits < NEVER)
     logs = log_of(limits)
     low, high = (logs[known].min(), logs[known].max()) if known.any() else (0.0, 0.0)

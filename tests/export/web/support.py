@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
+from scipy.ndimage import map_coordinates
 
 import nexwarp as nw
 from nexwarp import ops
@@ -126,15 +127,9 @@ def rendered(baked: Baked, camera: nw.Camera) -> torch.Tensor:
 
 def bilinear(atlas: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     """Values (..., C) of an image (H, W, C) at places (..., 2), column and row of texel centres."""
-    low = places.floor().long()
-    share = places - low
-    total = torch.zeros(*places.shape[:-1], atlas.shape[2], dtype=places.dtype)
-    for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        weight = (share[..., 0] if x else 1 - share[..., 0]) * (share[..., 1] if y else 1 - share[..., 1])
-        column = (low[..., 0] + x).clamp(0, atlas.shape[1] - 1)
-        row = (low[..., 1] + y).clamp(0, atlas.shape[0] - 1)
-        total += weight[..., None] * atlas[row, column]
-    return total
+    at = [places[..., 1].numpy(), places[..., 0].numpy()]
+    channels = [map_coordinates(channel, at, order=1, mode="nearest") for channel in atlas.movedim(-1, 0).numpy()]
+    return torch.from_numpy(np.stack(channels, -1))
 
 
 @torch.no_grad()
