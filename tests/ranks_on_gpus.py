@@ -64,7 +64,7 @@ def _graphs_of(trainer: ParallelTrainer) -> int:
         return 0
     if trainer.graphs.chances < 3:
         return -1
-    return sum(stage.graph is not None for stage in trainer.graphs.stages.values())
+    return sum(stage.captured is not None for stage in trainer.graphs.stages.values())
 
 
 if __name__ == "__main__":

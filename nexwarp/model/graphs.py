@@ -17,7 +17,7 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 from torch import nn
@@ -60,16 +60,18 @@ class CaptureError(Exception):
         self.memory = needed_memory(cause) is not None
 
 
-@contextmanager
-def _captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: tuple[int, int] | None) -> Iterator[None]:
-    """Capture what is launched inside; errors of torch and Warp become CaptureError."""
-    try:
-        with ops.captured(graph, stream, pool):
-            yield
-    except ops.UnknownLengthError:
-        raise
-    except (MemoryError, RuntimeError) as error:
-        raise CaptureError(error) from None  # whose traceback would keep what has been allocated
+class Captured(Generic[T]):
+    """Work that was captured, and its result, whose tensors each replay overwrites."""
+
+    def __init__(self, work: Callable[[], T], stream: torch.cuda.Stream, pool: tuple[int, int] | None) -> None:
+        self.graph = torch.cuda.CUDAGraph()
+        try:
+            with ops.captured(self.graph, stream, pool):
+                self.result = work()
+        except ops.UnknownLengthError:
+            raise
+        except (MemoryError, RuntimeError) as error:
+            raise CaptureError(error) from None  # whose traceback would keep what has been allocated
 
 
 def capturing(device: torch.device) -> bool:
@@ -137,21 +139,14 @@ def _tensors_of(module: nn.Module) -> list[torch.Tensor]:
     return tensors
 
 
-def replayed(frame: Frame) -> Rendering | None:
-    """Return the rendering by a graph; None if the frame is to be launched kernel by kernel."""
-    graphs = _graphs_for(frame)
-    return None if graphs is None else graphs.render(frame)
+def render(frame: Frame, *, whole: bool = True) -> Rendering:
+    """Render by a graph where there can be one; not `whole` keeps the image alone, which takes less memory.
 
-
-def replayed_image(frame: Frame) -> torch.Tensor | None:
-    """Return the image alone, which takes less memory; None if the frame is to be launched kernel by kernel."""
-    graphs = _graphs_for(frame)
-    return None if graphs is None else graphs.render_image(frame)
-
-
-def launched(frame: Frame) -> Rendering:
-    """Render kernel by kernel; where memory does not suffice, again without any graphs."""
+    Else render kernel by kernel; where memory does not suffice, again without any graphs.
+    """
     device = frame.surfels.device
+    if (graphs := _graphs_for(frame)) is not None and (rendering := graphs.render(frame, whole)) is not None:
+        return rendering
     camera = frame.camera if frame.camera.device == device else frame.camera.to(device)
     try:
         return frame.draw(camera, background=frame.background)
@@ -185,22 +180,24 @@ class FrameGraphs:
         # The last rendering, whose buffers any graph may overwrite.
         self.latest: weakref.ref[CapturedRendering] | None = None
 
-    def render(self, frame: Frame) -> Rendering | None:
+    def render(self, frame: Frame, whole: bool) -> "CapturedRendering | None":
         """Render by a graph; None if the frame is to be launched kernel by kernel."""
         with self.lock:
-            captured = self._find(frame, whole=True)
+            captured = self._find(frame, whole)
             if captured is None:
                 return None
-            stream = torch.cuda.current_stream(self.stream.device)
-            rendering = CapturedRendering.of(captured, self._replay(captured, frame), stream)
-            self.latest = weakref.ref(rendering)
+            if self.latest is not None and (latest := self.latest()) is not None:
+                latest.take_buffers()
+            with self.using():
+                captured.take(frame)
+                captured.graph.replay()
+                image, held = captured.image.clone(), ops.held(captured.room)  # both read the graph's memory
+            if not held:
+                # What was rendered is right, but slow, as the next frame by this graph would be.
+                del self.frames[captured.kind]
+            rendering = CapturedRendering.of(captured, image, torch.cuda.current_stream(self.stream.device))
+            self.latest = weakref.ref(rendering) if whole else None
             return rendering
-
-    def render_image(self, frame: Frame) -> torch.Tensor | None:
-        """Render the image alone by a graph; None if the frame is to be launched kernel by kernel."""
-        with self.lock:
-            captured = self._find(frame, whole=False)
-            return None if captured is None else self._replay(captured, frame)
 
     def _find(self, frame: Frame, whole: bool) -> "CapturedFrame | None":
         """Return the frame's graph, captured first where needed; None if the frame is to be launched."""
@@ -234,17 +231,6 @@ class FrameGraphs:
         self.clear()
         self.chances = self.chances - 1 if memory else 0
         return None
-
-    def _replay(self, captured: "CapturedFrame", frame: Frame) -> torch.Tensor:
-        """Return a copy of the image; what the rendering before still holds is copied for it first."""
-        if self.latest is not None and (latest := self.latest()) is not None:
-            latest.take_buffers()
-        self.latest = None
-        image, held = captured.replay(frame)
-        if not held:
-            # What was rendered is right, but slow, as the next frame by this graph would be.
-            del self.frames[captured.kind]
-        return image
 
     def clear(self) -> bool:
         """Drop all graphs and free their memory; return whether there were any."""
@@ -289,31 +275,29 @@ class CapturedFrame:
         self.staged = [x for x in (self.camera.numbers, self.camera.falloff) if x is not None]
         if graphs.pool is None:
             graphs.pool = torch.cuda.graph_pool_handle()
-        self.graph = torch.cuda.CUDAGraph()
-        with graphs.using(), _captured(self.graph, graphs.stream, graphs.pool):
-            result = frame.draw(self.camera, background=self.camera.color)
+        with graphs.using():
+            work = functools.partial(frame.draw, self.camera, background=self.camera.color)
+            captured = Captured(work, graphs.stream, graphs.pool)
+        self.graph, result = captured.graph, captured.result
         self.image, self.room = result.image, result.intermediates.tiles.room
         # Memory of what is not kept here serves other graphs.
         self.result = result if kind[0] else None
 
-    def replay(self, frame: Frame) -> tuple[torch.Tensor, bool]:
-        """Render another camera; return a copy of its image, and whether the lists have held all entries so far."""
+    def take(self, frame: Frame) -> None:
+        """Overwrite what the graph reads with another camera and background."""
         camera, background = frame.camera, frame.background
         assert isinstance(camera, Camera)
-        with self.graphs.using():
-            if isinstance(background, torch.Tensor):
-                self.camera.copy_(camera)
-                self.camera.color.copy_(background.detach().expand(3))
-            else:
-                self.camera.copy_(camera, color_numbers(background))
-            lens = (camera.fx, camera.fy, camera.cx, camera.cy)
-            if self.camera.falloff is not None and self.lens != lens:
-                falloff = None if frame.exposures is None else frame.exposures.falloff_of(camera)
-                assert falloff is not None
-                self.camera.falloff.copy_(falloff)
-                self.lens = lens
-            self.graph.replay()
-            return self.image.clone(), ops.held(self.room)  # both read the graph's memory
+        if isinstance(background, torch.Tensor):
+            self.camera.copy_(camera)
+            self.camera.color.copy_(background.detach().expand(3))
+        else:
+            self.camera.copy_(camera, color_numbers(background))
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        if self.camera.falloff is not None and self.lens != lens:
+            falloff = None if frame.exposures is None else frame.exposures.falloff_of(camera)
+            assert falloff is not None
+            self.camera.falloff.copy_(falloff)
+            self.lens = lens
 
 
 class CapturedRendering(Rendering):
@@ -494,7 +478,7 @@ class StepGraphs:
     def __init__(self, device: torch.device) -> None:
         self.stream = torch.cuda.Stream(device)
         self.pool: tuple[int, int] | None = None
-        self.keeper: torch.cuda.CUDAGraph | None = None
+        self.keeper: Captured[torch.Tensor] | None = None
         self.stages: dict[Hashable, _Stage] = {}
         self.steps = 0
         self.chances = CHANCES
@@ -544,26 +528,19 @@ class StepGraphs:
         stage.seen = self.steps
         if stage.state != state:
             # Kernels that have been launched are loaded, which a capture must not do.
-            known = stage.graph is not None and stage.state is not None and stage.state.kernels == state.kernels
-            stage.graph = stage.result = stage.losses = None
+            known = stage.captured is not None and stage.state is not None and stage.state.kernels == state.kernels
+            stage.captured = None
             stage.state = state
             if not known:
                 return work(stage.target)
-        if stage.graph is None:
-            self._keep_pool()
+        if stage.captured is None:
+            if self.keeper is None:  # torch frees a pool with its last graph
+                mark = torch.zeros(1, device=self.stream.device)
+                self.pool = torch.cuda.graph_pool_handle()
+                self.keeper = Captured(lambda: mark.add_(1), self.stream, self.pool)
             with suppress(ops.UnknownLengthError):
-                stage.capture(work, self.stream, self.pool)
-        return work(stage.target) if stage.graph is None else stage.replay()
-
-    def _keep_pool(self) -> None:
-        """Make a graph that keeps the memory pool: torch frees a pool with its last graph."""
-        if self.keeper is not None:
-            return
-        keeper, mark = torch.cuda.CUDAGraph(), torch.zeros(1, device=self.stream.device)
-        self.pool = torch.cuda.graph_pool_handle()
-        with _captured(keeper, self.stream, self.pool):
-            mark.add_(1)
-        self.keeper = keeper
+                stage.captured = Captured(functools.partial(_stacked, work, stage.target), self.stream, self.pool)
+        return work(stage.target) if stage.captured is None else stage.replay(stage.captured)
 
 
 def beside(graphs: StepGraphs | None, work: Callable[[], T]) -> T:
@@ -589,9 +566,7 @@ class _Stage:
         self.target = dataclasses.replace(target, camera=self.camera, **self.tensors)
         self.seen = 0
         self.state: GraphKey | None = None
-        self.graph: torch.cuda.CUDAGraph | None = None
-        self.result: StepResult | None = None
-        self.losses: torch.Tensor | None = None
+        self.captured: Captured[tuple[StepResult, torch.Tensor]] | None = None
 
     def take(self, target: Any) -> None:
         """Overwrite the tensors with those of another target of the kind."""
@@ -599,27 +574,22 @@ class _Stage:
             place.copy_(getattr(target, name))
         self.camera.copy_(target.camera)
 
-    def capture(
-        self, work: Callable[[Any], StepResult], stream: torch.cuda.Stream, pool: tuple[int, int] | None
-    ) -> None:
-        """Capture the work."""
-        graph = torch.cuda.CUDAGraph()
-        with _captured(graph, stream, pool):
-            self.result = work(self.target)
-            self.losses = torch.stack(list(self.result.losses.values()))
-        self.graph = graph
-
-    def replay(self) -> StepResult:
+    def replay(self, captured: Captured[tuple[StepResult, torch.Tensor]]) -> StepResult:
         """Replay the captured work."""
-        assert self.graph is not None and self.result is not None and self.losses is not None
-        self.graph.replay()
-        result = self.result
+        captured.graph.replay()
+        result, losses = captured.result
         with updating():  # the replay has done that
             if not ops.fits(result.room):
                 self.state = None
             # Copies: they may be read after the next replay has overwritten the graph's own.
-            losses = dict(zip(result.losses, self.losses.clone().unbind(), strict=True))
-            return result._replace(losses=losses, image=result.image.clone())
+            copies = dict(zip(result.losses, losses.clone().unbind(), strict=True))
+            return result._replace(losses=copies, image=result.image.clone())
+
+
+def _stacked(work: Callable[[Any], StepResult], target: Any) -> tuple[StepResult, torch.Tensor]:
+    """Do a step; return its losses as one tensor, too."""
+    result = work(target)
+    return result, torch.stack(list(result.losses.values()))
 
 
 def _kind(target: Any) -> Hashable:

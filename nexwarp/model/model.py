@@ -127,9 +127,7 @@ class Model(nn.Module):
             raise TypeError(f"camera: expected a nexwarp.Camera or a sequence of them, got {type(camera).__name__}")
         if isinstance(camera, RayCamera):
             return self._faces(camera, background, changes)
-        frame = self._frame(camera, background, changes)
-        rendering = graphs.replayed(frame)
-        return graphs.launched(frame) if rendering is None else rendering
+        return graphs.render(self._frame(camera, background, changes))
 
     def render_image(
         self, camera: Camera, *, background: Color | None = None, **changes: Unpack[RenderChanges]
@@ -152,9 +150,7 @@ class Model(nn.Module):
         if not isinstance(camera, Camera):
             raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
         with torch.no_grad():
-            frame = self._frame(camera, background, changes)
-            image = graphs.replayed_image(frame)
-            return graphs.launched(frame).image if image is None else image
+            return graphs.render(self._frame(camera, background, changes), whole=False).image
 
     def _faces(self, camera: RayCamera, background: Color | None, changes: RenderChanges) -> Rendering:
         options = self.options.changed(**changes)

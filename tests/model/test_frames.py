@@ -13,6 +13,7 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp import ops
 from nexwarp.cameras.camera import StagedCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.model import graphs as frames
@@ -230,10 +231,12 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, int]]:
     class Captured:
         def __init__(self, graphs: frames.FrameGraphs, frame: Frame, kind: tuple[Any, ...]) -> None:
             self.state, self.kind = frame.state, kind
+            self.image, self.room, self.graph = torch.zeros(3), None, self
             captured.append((kind[0], frame.camera.width))
 
-        def replay(self, frame: Frame) -> tuple[torch.Tensor, bool]:
-            return torch.zeros(3), True
+        def take(self, frame: Frame) -> None: ...
+
+        def replay(self) -> None: ...
 
     class Stream:
         def __init__(self, device: torch.device) -> None:
@@ -241,6 +244,8 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, int]]:
 
     monkeypatch.setattr(frames, "CapturedFrame", Captured)
     monkeypatch.setattr(torch.cuda, "Stream", Stream)
+    monkeypatch.setattr(frames.FrameGraphs, "using", nullcontext)
+    monkeypatch.setattr(ops, "held", lambda _: True)
     monkeypatch.setattr(torch.cuda, "Event", object)
     monkeypatch.setattr(torch.cuda, "current_stream", Stream)
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
@@ -264,17 +269,17 @@ def test_a_graph_that_keeps_all_buffers_gives_images_too(stand_ins: list[tuple[b
     model = finished("cpu")
     group = share([model])
     for width in (61, 33):
-        assert group.render_image(request_of(model, width)) is None
+        assert group.render(request_of(model, width), False) is None
         for _ in range(3):
-            assert group.render_image(request_of(model, width)) is not None
+            assert group.render(request_of(model, width), False) is not None
     assert stand_ins == [(False, 61), (False, 33)]
     for _ in range(3):
-        group.render(request_of(model))
-        group.render_image(request_of(model))
+        group.render(request_of(model), True)
+        group.render(request_of(model), False)
     assert stand_ins[2:] == [(True, 61)]
     model.surfels.means = torch.nn.Parameter(model.surfels.means + 1)  # needs other graphs
-    assert group.render_image(request_of(model)) is None
-    assert group.render_image(request_of(model)) is not None
+    assert group.render(request_of(model), False) is None
+    assert group.render(request_of(model), False) is not None
     assert stand_ins[3:] == [(False, 61)]
 
 
@@ -283,7 +288,7 @@ def test_models_that_share_graphs_have_graphs_of_their_own(stand_ins: list[tuple
     before = [share([model]) for model in models[:2]]
     for group, model in zip(before, models, strict=False):
         for _ in range(2):
-            group.render(request_of(model))
+            group.render(request_of(model), True)
         assert len(group.frames) == 1
     group = share(models)
     assert [len(each.frames) for each in before] == [0, 0], "graphs that nobody can drop any more stay in memory"
@@ -291,7 +296,7 @@ def test_models_that_share_graphs_have_graphs_of_their_own(stand_ins: list[tuple
     for _ in range(3):
         for model in models:
             for width in range(30, 30 + frames.MOST_GRAPHS):
-                group.render_image(request_of(model, width))
+                group.render(request_of(model, width), False)
     assert len(stand_ins) == len(group.frames) == 3 * frames.MOST_GRAPHS
 
 

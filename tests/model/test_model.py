@@ -194,7 +194,7 @@ def test_four_functions_lead_to_the_first_op(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(ops, "activate", spy)
     full_model().render(cameras_of()[0])
-    assert paths == [["activated", "draw", "launched", "render"]]
+    assert paths == [["activated", "draw", "render", "render"]]
 
 
 def test_nothing_is_rendered_twice(monkeypatch: pytest.MonkeyPatch) -> None:

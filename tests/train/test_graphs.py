@@ -43,7 +43,7 @@ def trained(scene: Scene, **changes: Any) -> Trainer:
 
 def graphs_of(trainer: Trainer) -> int:
     assert trainer.graphs is not None
-    return sum(stage.graph is not None for stage in trainer.graphs.stages.values())
+    return sum(stage.captured is not None for stage in trainer.graphs.stages.values())
 
 
 def half(view: View) -> View:
@@ -141,7 +141,7 @@ def test_a_first_training_in_a_process(tiny_folder: Path) -> None:
         "captured = 0\n"
         "for _ in range(12):\n"
         "    trainer.step()\n"
-        "    captured += sum(stage.graph is not None for stage in trainer.graphs.stages.values())\n"
+        "    captured += sum(stage.captured is not None for stage in trainer.graphs.stages.values())\n"
         "assert captured\n"
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
@@ -261,11 +261,11 @@ def test_rounds_at_the_budget_keep_the_graph(tiny_scene: Scene, monkeypatch: pyt
     trainer = Trainer(tiny_scene, Config(**(SETTINGS | changes)), "cuda")
     captured: list[int] = []
     replaced: list[int] = []
-    capture, control = step_graphs._Stage.capture, DensityControl.step
+    stacked, control = step_graphs._stacked, DensityControl.step
 
-    def noted(*given: Any) -> None:
+    def noted(*given: Any) -> Any:
         captured.append(trainer.iteration)
-        capture(*given)
+        return stacked(*given)
 
     def counted(densifier: DensityControl, *given: Any) -> torch.Tensor:
         before = len(densifier.surfels)
@@ -275,7 +275,7 @@ def test_rounds_at_the_budget_keep_the_graph(tiny_scene: Scene, monkeypatch: pyt
         return rows
 
     monkeypatch.setattr(ops, "fits", lambda room: True)  # short lists are slow but right, and no reason here
-    monkeypatch.setattr(step_graphs._Stage, "capture", noted)
+    monkeypatch.setattr(step_graphs, "_stacked", noted)
     monkeypatch.setattr(DensityControl, "step", counted)
     trainer.run()
     assert len(replaced) > 3 and captured

@@ -205,7 +205,7 @@ def test_own_losses_and_optimizers_are_captured_where_they_can_be(
 
     def observe(_: nw.StepReport) -> None:
         if trainer.graphs is not None:
-            replayed.extend(stage.graph is not None for stage in trainer.graphs.stages.values())
+            replayed.extend(stage.captured is not None for stage in trainer.graphs.stages.values())
 
     for graphs in (False, True):
         config = dataclasses.replace(SMALL, iterations=120, deterministic=True, cuda_graphs=graphs)
