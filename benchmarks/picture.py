@@ -15,8 +15,7 @@ from nexwarp.io.files import written_aside
 from nexwarp.io.pictures import side_by_side, to_uint8
 from nexwarp.model.buffers import render_buffers
 from nexwarp.model.model import Model
-from nexwarp.run.folder import read_run
-from nexwarp.run.opened import open_model
+from nexwarp.run.folder import open_model, read_run
 from notebooks.figures import surfel_colours
 
 CAPTIONS = ("photo (held out)", "rendering", "surfels without the texture", "surfel of each pixel")

@@ -34,7 +34,6 @@ from nexwarp.cameras.paths import ellipse
 from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.cli import __version__ as __version__
 from nexwarp.data import Scene, View, load_scene
-from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
@@ -42,7 +41,7 @@ from nexwarp.model.options import RenderOptions
 from nexwarp.model.rasterize import compose, rasterize
 from nexwarp.model.render import Rendering, render
 from nexwarp.model.surfels import Surfels
-from nexwarp.model.texture import Hits, NeuralTexture, Texture, register_texture
+from nexwarp.model.texture import DetailLimits, Hits, NeuralTexture, Texture, register_texture
 from nexwarp.ops import tape as tape
 from nexwarp.train.api import train
 from nexwarp.train.densify import DensityControl

@@ -28,8 +28,16 @@ from nexwarp.run import warmup
 from nexwarp.run.evaluate import check_metrics, evaluate
 from nexwarp.run.export import ExportOrder, export_run
 from nexwarp.run.fit_poses import fit_poses
-from nexwarp.run.folder import METRICS_FILE, RENDERS_FOLDER, keep_camera_path, locked_run, read_metrics
-from nexwarp.run.opened import OpenedModel, near_depth, open_model
+from nexwarp.run.folder import (
+    METRICS_FILE,
+    RENDERS_FOLDER,
+    OpenedModel,
+    keep_camera_path,
+    locked_run,
+    near_depth,
+    open_model,
+    read_metrics,
+)
 from nexwarp.run.render import RenderOrder
 from nexwarp.train.recipe import MASK_MODES, preset
 

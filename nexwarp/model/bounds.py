@@ -7,8 +7,7 @@ import torch
 from nexwarp.cameras.camera import LARGEST_DISTANCE
 from nexwarp.errors import check_values
 from nexwarp.kernels.activate import SHORTEST
-from nexwarp.model.detail_limits import NEVER
-from nexwarp.model.texture import LARGEST_RESOLUTION
+from nexwarp.model.texture import LARGEST_RESOLUTION, NEVER
 
 LARGEST_HALF = 65504.0
 ROUNDING = 1 + 1e-6  # of the texture's resolutions

@@ -26,12 +26,11 @@ from nexwarp import ops
 from nexwarp.cameras.camera import Camera, StagedCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.machine import needed_memory
-from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Color, RenderOptions, color_numbers
 from nexwarp.model.render import Rendering, draw
 from nexwarp.model.surfels import Surfels
-from nexwarp.model.texture import NeuralTexture, Texture
+from nexwarp.model.texture import DetailLimits, NeuralTexture, Texture
 
 log = logging.getLogger(__name__)
 

@@ -14,13 +14,12 @@ from nexwarp.cameras.cameras_file import WORLD, origin_of
 from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.io.json_files import Json
 from nexwarp.model import graphs
-from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.faces import draw_faces
 from nexwarp.model.options import Color, RenderChanges, RenderOptions, color_tensor
 from nexwarp.model.render import Rendering
 from nexwarp.model.surfels import Surfels
-from nexwarp.model.texture import Texture
+from nexwarp.model.texture import DetailLimits, Texture
 
 
 class Model(nn.Module):

@@ -9,11 +9,10 @@ from nexwarp import ops
 from nexwarp.cameras.camera import Camera
 from nexwarp.errors import OutOfMemoryError, check_tensors
 from nexwarp.machine import keep_freed_memory, needed_memory
-from nexwarp.model.detail_limits import DetailLimits, limited_depths
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Color, RenderOptions, color_tensor
 from nexwarp.model.surfels import Activated, Surfels
-from nexwarp.model.texture import Hits, NeuralTexture, Texture
+from nexwarp.model.texture import DetailLimits, Hits, NeuralTexture, Texture, limited_depths
 from nexwarp.ops.tiles import Order
 
 MAX_JITTER = 1000.0  # pixels

@@ -1,6 +1,7 @@
 """Evaluation on held-out views, with metrics computed from 8-bit images to be comparable with published numbers."""
 
 import importlib.util
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -9,15 +10,17 @@ from statistics import fmean
 from typing import TypedDict, cast
 
 import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch.nn.functional import conv2d, max_pool2d, normalize
 
 from nexwarp.data import View
-from nexwarp.errors import SettingError
-from nexwarp.io.files import one_line
+from nexwarp.errors import FormatError, SettingError
+from nexwarp.io.files import check_tensors_header, one_line
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model
 from nexwarp.ops.ssim import ssim_map
 from nexwarp.run.folder import COMPARE, TEST, picture_name
-from nexwarp.run.lpips import load_vgg, weights_file
 from nexwarp.train.ranks.ranks import Ranks
 
 PIXELS_PER_DEGREE = 67.02064514160156  # FLIP's default: a display 0.7 m and 3840 pixels wide, from 0.7 m
@@ -28,6 +31,10 @@ CONVENTION = (
     "LPIPS: VGG, v0.1, input in [0, 1], not rescaled to [-1, 1]. FLIP: LDR, 67 pixels per degree, mean of the "
     "map. A set's figure is the mean over its images."
 )
+
+# Convolutions of torchvision's `features` in five blocks; LPIPS compares what leaves each of them.
+BLOCKS = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of ImageNet's colours, for inputs in [-1, 1]
 
 Values = dict[str, float | None]  # of a view, by metric
 
@@ -256,3 +263,51 @@ def _unit_images(
 def _included(values: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
     """Return the values (P, C) of the P included pixels of (H, W, C) values; all of them without a mask."""
     return values if mask is None else values[mask.to(values.device)]
+
+
+def weights_file() -> Path:
+    """Return the file of the weights: $NEXWARP_LPIPS, else lpips/vgg16.safetensors in the user's cache folder."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(os.environ.get("NEXWARP_LPIPS") or cache / "nexwarp" / "lpips" / "vgg16.safetensors")
+
+
+class VGG(torch.nn.Module):
+    """Distances of features that VGG-16 computes of two pictures."""
+
+    def __init__(self, weights: dict[str, torch.Tensor]) -> None:
+        """Take `0.weight`, `0.bias` ... `28.bias` of torchvision's features, and the heads `lin0` ... `lin4`."""
+        super().__init__()
+        self.weights = {name: values.float() for name, values in weights.items()}
+
+    def forward(self, image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Return the distance, a scalar, of two (H, W, 3) pictures.
+
+        The values go in as they are. The paper and 3DGS pass [0, 1], LPIPS's authors [-1, 1].
+        """
+        pictures = torch.stack([image, target]).permute(0, 3, 1, 2).float()
+        shift, scale = (pictures.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
+        features, distance = (pictures - shift) / scale, pictures.new_zeros(())
+        for block, layers in enumerate(BLOCKS):
+            if block > 0:
+                features = max_pool2d(features, 2)
+            for layer in layers:
+                weight, bias = (self.weights[f"{layer}.{name}"].to(features.device) for name in ("weight", "bias"))
+                features = conv2d(features, weight, bias, padding=1).relu()
+            first, second = normalize(features, eps=1e-10)
+            head = self.weights[f"lin{block}"].to(features.device)
+            distance = distance + ((first - second).square() * head[:, None, None]).sum(0).mean()
+        return distance
+
+
+def load_vgg(file: Path) -> VGG:
+    """Read the network from a file of `python -m benchmarks.lpips_weights`."""
+    try:
+        check_tensors_header(file)
+        weights = load_file(file)
+    except SafetensorError as error:
+        raise FormatError(f"{file}: damaged, {error}") from None
+    expected = {f"{layer}.{name}" for layers in BLOCKS for layer in layers for name in ("weight", "bias")}
+    expected |= {f"lin{block}" for block in range(len(BLOCKS))}
+    if missing := sorted(expected - weights.keys()):
+        raise FormatError(f"{file}: expected the weights of LPIPS with VGG-16, {missing[0]} is missing")
+    return VGG(weights)

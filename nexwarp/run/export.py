@@ -24,8 +24,7 @@ from nexwarp.export.splats import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, sav
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import JsonObject, write_json
 from nexwarp.model.model_file import save_model
-from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, ORIGIN_FILE, TRAIN
-from nexwarp.run.opened import OpenedModel
+from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, ORIGIN_FILE, TRAIN, OpenedModel
 
 PACKAGES = {"glb": ("trimesh", "glb"), "spz": ("gaussforge", "splats")}  # that formats need, and their extras
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows

@@ -24,8 +24,7 @@ from nexwarp.model.buffers import render_buffers, save_buffers
 from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.ops.tiles import Order
-from nexwarp.run.folder import FILE_PATH, RENDERS_FOLDER, TEST, TRAIN, picture_name
-from nexwarp.run.opened import OpenedModel, near_depth
+from nexwarp.run.folder import FILE_PATH, RENDERS_FOLDER, TEST, TRAIN, OpenedModel, near_depth, picture_name
 
 FRAMES = 120
 FPS = 30.0

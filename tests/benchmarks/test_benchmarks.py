@@ -20,7 +20,7 @@ from benchmarks.suite import Options, table
 from benchmarks.timing import ROOT, Measurement, Repeats, measure
 from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.io.pictures import CAPTION_HEIGHT, to_uint8
-from nexwarp.model.detail_limits import NEVER
+from nexwarp.model.texture import NEVER
 from nexwarp.ops import Pinhole
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 

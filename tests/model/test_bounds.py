@@ -13,9 +13,9 @@ import torch
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.model.bounds import BOUNDS
-from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model_file import load, save_model
+from nexwarp.model.texture import DetailLimits
 from tests.model_file_support import rewrite
 from tests.narrowing import present
 from tests.scenes import make_camera, make_surfels, random_scene

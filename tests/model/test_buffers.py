@@ -9,7 +9,7 @@ import torch
 import nexwarp as nw
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.buffers import Buffers, load_buffers, render_buffers, save_buffers
-from nexwarp.model.detail_limits import DetailLimits
+from nexwarp.model.texture import DetailLimits
 from tests.reference.collect import camera_rays, pixel_centers, rotations
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import FLIPS, assert_close

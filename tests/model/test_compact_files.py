@@ -13,10 +13,18 @@ import nexwarp as nw
 from examples import read_model
 from nexwarp.cli import main as cli
 from nexwarp.io.pictures import to_uint8
-from nexwarp.model.compact import CODE, DTYPES, REACH, decode, encode
-from nexwarp.model.detail_limits import NEVER, DetailLimits
 from nexwarp.model.model import Model
-from nexwarp.model.model_file import COMPACT_VERSION, MODEL_FILE, save_model
+from nexwarp.model.model_file import (
+    CODE,
+    COMPACT_DTYPES,
+    COMPACT_VERSION,
+    MODEL_FILE,
+    REACH,
+    decode,
+    encode,
+    save_model,
+)
+from nexwarp.model.texture import NEVER, DetailLimits
 from nexwarp.run.evaluate import psnr
 from tests.model_file_support import make_model, refused, rewrite
 from tests.scenes import make_camera, random_scene
@@ -68,7 +76,7 @@ def test_every_number_is_within_half_a_step(tmp_path: Path) -> None:
             scale = coded[name + CODE][0]
             scale = scale[:, None, None] if name == "texture.grid" else scale
             assert bool(((after[name].abs() / scale).sqrt() - (values.abs() / scale).sqrt()).abs().max() <= 0.51), name
-        elif name in DTYPES:
+        elif name in COMPACT_DTYPES:
             assert bool((error <= 0.51 * coded[name + CODE][1]).all()), name
         else:
             assert torch.equal(after[name], values), name

@@ -8,9 +8,9 @@ import torch
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.model.detail_limits import NEVER, DetailLimits
 from nexwarp.model.render import antialiased
 from nexwarp.model.render import draw as draw_parts
+from nexwarp.model.texture import NEVER, DetailLimits
 from nexwarp.train.finish.detail_limits import measure_detail_limits
 from tests.render_support import BACKGROUND, MAX_HITS, assert_same
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene

@@ -18,10 +18,10 @@ from nexwarp.cli import main as cli
 from nexwarp.data.scene import SceneSource
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.buffers import load_buffers, render_buffers
-from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.model.render import draw
+from nexwarp.model.texture import DetailLimits
 from nexwarp.run.folder import RunRecord, create_run
 from nexwarp.train.recipe import Config
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene

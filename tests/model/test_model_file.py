@@ -13,12 +13,12 @@ import torch
 from safetensors import safe_open
 
 import nexwarp as nw
-from nexwarp.model.detail_limits import NEVER, DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import FORMAT_VERSION, LATER_OPTIONS, MODEL_FILE, save_model
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.render import draw
+from nexwarp.model.texture import NEVER, DetailLimits
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from tests.model_file_support import META, OPTIONS, make_model, refused, rewrite
 from tests.scenes import make_camera, make_surfels, random_scene

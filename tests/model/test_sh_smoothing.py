@@ -173,7 +173,7 @@ def test_finishing_leaves_the_training_as_it_is(scene: Scene, device: torch.devi
 
     def observe(_: nw.StepReport) -> None:
         if asked.graphs is not None:
-            replayed.extend(stage.graph is not None for stage in asked.graphs.stages.values())
+            replayed.extend(stage.captured is not None for stage in asked.graphs.stages.values())
 
     asked.run(observe, until=30)
     assert any(replayed) == (device.type == "cuda")

@@ -5,7 +5,7 @@ import torch
 
 from nexwarp import ops
 from nexwarp.kernels.detail import FILTER
-from nexwarp.model.detail_limits import NEVER
+from nexwarp.model.texture import NEVER
 from tests.tolerances import assert_close, assert_finite
 
 # Depths, scales, opacities and gammas.

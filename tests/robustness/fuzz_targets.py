@@ -27,10 +27,10 @@ from nexwarp.data.sfm.photos import MAKE, MODEL, camera_groups, read_photos
 from nexwarp.export.splats import save_splats_ply
 from nexwarp.io.json_files import write_json
 from nexwarp.io.pictures import load_exr, save_exr
-from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
+from nexwarp.model.texture import DetailLimits
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
 from nexwarp.train.recipe import Config, TextureConfig
 from nexwarp.train.trainer import Trainer

@@ -15,7 +15,7 @@ from nexwarp.errors import SettingError
 from nexwarp.io.pictures import to_uint8
 from nexwarp.ops import ssim as ops_ssim
 from nexwarp.run import evaluate as metrics
-from nexwarp.run.lpips import BLOCKS, load_vgg
+from nexwarp.run.evaluate import BLOCKS, load_vgg
 
 
 def images(height: int = 48, width: int = 61) -> list[torch.Tensor]:

@@ -13,7 +13,7 @@ from nexwarp.cameras.paths import surrounding
 from nexwarp.cli import main as cli
 from nexwarp.io.json_files import read_json
 from nexwarp.run.evaluate import METRICS, evaluate
-from nexwarp.run.opened import near_depth, open_model
+from nexwarp.run.folder import near_depth, open_model
 from nexwarp.train.trainer import Trainer
 from tests.scene_writers import write_demo
 from tests.scenes import make_surfels, make_texture, random_scene

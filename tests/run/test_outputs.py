@@ -23,8 +23,7 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
 from nexwarp.model.options import RenderOptions
-from nexwarp.run.folder import RunRecord, create_run
-from nexwarp.run.opened import open_model
+from nexwarp.run.folder import RunRecord, create_run, open_model
 from nexwarp.run.render import RenderOrder
 from nexwarp.train.recipe import Config
 from tests.cameras.test_paths import ring

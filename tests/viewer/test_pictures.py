@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.model.detail_limits import DetailLimits
 from nexwarp.model.exposures import Exposures
+from nexwarp.model.texture import DetailLimits
 from nexwarp.viewer.modes import BY_SLOT, MODES, TEXTURED, Picture, Settings, draw
 from nexwarp.viewer.world import Viewpoint, camera_to_world, vertical_fov
 from tests.scenes import make_surfels, make_texture, random_scene

@@ -6,7 +6,7 @@ away costs the others no precision.
 
 import numpy as np
 
-from nexwarp.model.detail_limits import NEVER
+from nexwarp.model.texture import NEVER
 
 CHUNK = 256
 MORTON_BITS = 10

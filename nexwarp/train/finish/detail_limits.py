@@ -6,8 +6,8 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.kernels.types import ALPHA_MIN
-from nexwarp.model.detail_limits import NEVER, DetailLimits
 from nexwarp.model.model import Model
+from nexwarp.model.texture import NEVER, DetailLimits
 
 
 @torch.no_grad()

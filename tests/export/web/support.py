@@ -23,7 +23,7 @@ from nexwarp.export.bake import Baked, hits_of, untextured
 from nexwarp.export.web.baked import encode_harmonics, encode_picture
 from nexwarp.export.web.quantise import CHUNK
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
-from nexwarp.model.detail_limits import NEVER
+from nexwarp.model.texture import NEVER
 from tests.reference.collect import rotations
 from tests.scenes import intrinsics, make_camera, make_surfels, random_scene, rigid
 

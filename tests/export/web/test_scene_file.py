@@ -12,8 +12,8 @@ import torch
 import nexwarp as nw
 from nexwarp.export.web.quantise import CHUNK, encode_chunks, encode_limits, encode_quats, morton_order
 from nexwarp.export.web.scene_file import encode_scene, scene_arrays
-from nexwarp.model.detail_limits import NEVER
 from nexwarp.model.options import RenderOptions
+from nexwarp.model.texture import NEVER
 from tests.export.web import support
 from tests.export.web.support import named_cameras, read_sections, read_surfels, web_model
 from tests.reference.collect import rotations
