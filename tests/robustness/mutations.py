@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 AGREE = "tests/robustness/test_agreement.py -k reference"
 WEB = "tests/export/web/test_webgpu.py -k buffers"
 BAKED = "tests/export/web/test_page.py -k baked_scene"
-HARMONICS = "tests/export/web/test_export.py -k harmonics"
+HARMONICS = "tests/export/web/test_scene_file.py -k harmonics"
 DENSE = "tests/train/test_densify.py"
 KERNELS, SHADERS, PAGE = "kernels/", "export/web/shaders/", "export/web/page/"
 
@@ -88,7 +88,7 @@ MUTATIONS = [
     # 51: export and the page
     Mutation("export/splats.py", 'raw["shN"].mT.flatten(1)', 'raw["shN"].flatten(1)', "tests/export/test_export.py"),
     Mutation("export/splats.py", "SPACING = 1.4", "SPACING = 2.4", "tests/export/test_export.py"),
-    Mutation("export/mesh.py", "vertices + origin, -normals", "vertices + origin, normals", "tests/export/test_mesh.py"),
+    Mutation("export/mesh.py", "vertices + origin, -normals", "vertices + origin, normals", "tests/export/test_export.py"),
     Mutation("export/web/quantise.py", "low, high = (logs[known].min()", "low, high = (logs.min()", "tests/export/web/test_scene_file.py"),
     Mutation(SHADERS + "collect.wgsl", "alpha >= ALPHA_MIN && depth > near", "alpha >= ALPHA_MIN", "tests/export/web/test_webgpu.py -k near"),
     Mutation(SHADERS + "collect.wgsl", "out_weight > slot_weights[j]", "out_weight >= slot_weights[j]", "tests/export/web/test_webgpu.py -k equal"),

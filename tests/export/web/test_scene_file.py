@@ -1,6 +1,8 @@
-"""Scene files: what comes back, how large they are, and what damaged ones say."""
+"""Scene files, and the page as one file or a folder: what comes back, what damaged files say, what a page holds."""
 
+import base64
 import json
+import re
 import struct
 import zlib
 from functools import cache
@@ -10,8 +12,10 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp.export.web.export import INDEX, export_web, one_file, static_files
 from nexwarp.export.web.quantise import CHUNK, encode_chunks, encode_limits, encode_quats, morton_order
-from nexwarp.export.web.scene_file import encode_scene, scene_arrays
+from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene, scene_arrays
+from nexwarp.kernels import sh
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.texture import NEVER
 from tests.export.web import support
@@ -134,10 +138,9 @@ def damaged() -> dict[str, bytes]:
     texture, options = header["texture"], header["options"]
     large = [{**e, "shape": [3, 2**30, 2]} if e["name"] == "grid" else e for e in header["sections"]]
     huge = changed(texture={**texture, "table_size": 2**30}, sections=large)
-    sh = next(e for e in header["sections"] if e["name"] == "sh")
-    bomb = zlib.compress(bytes(50_000_000))
-    begin = 16 + length + sh["offset"]
-    bombed = content[:begin] + bomb[: sh["bytes"]].ljust(sh["bytes"], b"\0") + content[begin + sh["bytes"] :]
+    last = next(e for e in header["sections"] if e["name"] == "sh")
+    begin, end = 16 + length + last["offset"], 16 + length + last["offset"] + last["bytes"]
+    bombed = content[:begin] + zlib.compress(bytes(50_000_000))[: end - begin].ljust(end - begin, b"\0") + content[end:]
     return {
         "empty": b"",
         "newer version": content[:8] + struct.pack("<I", 2) + content[12:],
@@ -162,3 +165,54 @@ def damaged() -> dict[str, bytes]:
         "low-pass filter": changed(options={**options, "low_pass": True}),
         "SH of degree 4": changed(sh_coefficients=25),
     }
+
+
+def page_of() -> tuple[str, dict[str, bytes]]:
+    """The one file, and what it is made of."""
+    content = {**static_files(), SCENE_FILE: content_of()}
+    return one_file(content).decode(), content
+
+
+def test_one_file_holds_every_module_and_asset():
+    page, content = page_of()
+    (text,) = re.findall(r'<script type="importmap">(.*?)</script>', page)
+    modules = json.loads(text)["imports"]
+    imported = set()
+    for name, data in content.items():
+        if name.endswith(".js"):
+            prefix, encoded = modules.pop(f"nexwarp/{name}").split(",")
+            assert prefix == "data:text/javascript;base64" and base64.b64decode(encoded) == data
+            imported |= set(re.findall(r'from "([^"]+)"', data.decode()))
+        elif not name.endswith((".css", ".html")):
+            (encoded,) = re.findall(rf'id="asset:{re.escape(name)}">([^<]*)</script>', page)
+            assert base64.b64decode(encoded) == data
+    assert modules == {} and imported <= {f"nexwarp/{name}" for name in content}
+    # The assets come before the scripts that look for them.
+    assert page.index('id="asset:scene.nxw"') < page.index('import "nexwarp/viewer.js"')
+
+
+def test_the_page_names_no_other_server():
+    page, content = page_of()
+    texts = [data.decode() for name, data in content.items() if name.endswith((".js", ".css", ".wgsl", ".html"))]
+    for text in [page, *texts]:
+        found = re.findall(r"(?:https?:)?//[a-z0-9.-]+\.[a-z]{2,}[^\s\"']*", text)
+        assert [url for url in found if "www.w3.org" not in url] == []  # names of XML, not addresses
+
+
+def test_titles_are_text(tmp_path, monkeypatch):
+    monkeypatch.setattr("nexwarp.export.web.export.bake", lambda *_: {})
+    model, camera = web_model(5)
+    files = export_web(model, named_cameras(camera), tmp_path / "page", title="<b>R&D</b>")
+    assert {file.relative_to(tmp_path / "page").as_posix() for file in files} == {*static_files(), SCENE_FILE}
+    index = (tmp_path / "page" / INDEX).read_text(encoding="utf-8")
+    assert "&lt;b&gt;R&amp;D&lt;/b&gt;" in index and "<b>R&D" not in index and "__TITLE__" not in index
+    assert read_sections((tmp_path / "page" / SCENE_FILE).read_bytes())[0]["surfels"] == 5
+
+
+@pytest.mark.parametrize("name", ["shaders/common.wgsl", "baked_shaders.js"])
+def test_spherical_harmonics_of_shaders_have_the_kernels_constants(name: str) -> None:
+    """All digits, and no other constants: pictures would not show half a percent of one."""
+    text = static_files()[name].decode()
+    basis = text[text.index("0.28209") : text.rindex("3.0 * ")]
+    constants = {float(number) for number in re.findall(r"(?<![\w.])\d+\.\d+", basis)} - {2.0, 3.0, 4.0, 0.0}
+    assert constants == {sh.BAND_0, sh.BAND_1, *sh.BAND_2, *sh.BAND_3}
