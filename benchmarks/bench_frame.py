@@ -16,7 +16,7 @@ from benchmarks.scenes import SurfelScene, texture
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure, synchronize
 from nexwarp.model.exposures import Exposures
-from nexwarp.train.finish.detail_limits import measure_detail_limits
+from nexwarp.train.finish import measure_detail_limits
 
 STEADY_FRAMES = 50
 # The shape that `nexwarp train` gives a texture by default.

@@ -12,7 +12,7 @@ from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 from nexwarp import ops
 from nexwarp.model.texture import limited_depths
-from nexwarp.train.finish.detail_limits import measure_detail_limits
+from nexwarp.train.finish import measure_detail_limits
 
 
 def texturing(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[Measurement]:

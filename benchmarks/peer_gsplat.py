@@ -22,8 +22,8 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.ops.ssim import weighted_dssim
 from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
 from nexwarp.train.initial import starting_points
+from nexwarp.train.losses import SATURATION
 from nexwarp.train.recipe import Config
-from nexwarp.train.step_losses import SATURATION
 from nexwarp.train.views import TrainingViews, mean_color
 
 FLOATS = {"3dgs": 11, "2dgs": 10}  # a primitive without SH: means 3, quats 4, scales 3 or 2, opacity 1

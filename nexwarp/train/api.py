@@ -9,11 +9,11 @@ from typing_extensions import Unpack
 from nexwarp.data import Scene
 from nexwarp.model.model import Model
 from nexwarp.train.initial import Start, check_start
+from nexwarp.train.losses import OwnLoss
+from nexwarp.train.optimizer import OptimizerMaker
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
-from nexwarp.train.schedules import OptimizerMaker
 from nexwarp.train.stages import StageStore, stage_runner
-from nexwarp.train.step_losses import OwnLoss
 
 Callback = Callable[[StepReport], object]
 

@@ -19,6 +19,7 @@ from nexwarp.model.texture import check_sizes
 from nexwarp.ops.tiles import check_order
 
 REFERENCE_ITERATIONS = 30_000
+NORMALS_FROM = 7_000  # iteration, of a run of 30,000, from which the normal loss counts: that of 2DGS
 MIN_SURFELS = 16
 MASK_MODES = ("ignore", "background")
 MOST_TEACHERS = 8
@@ -295,6 +296,10 @@ class Config(Recipe):
         """K at an iteration of this run: `max_hits`, but at most 2 while surfels settle."""
         settled = math.ceil(self.more_hits_from * self.iterations / REFERENCE_ITERATIONS)
         return self.max_hits if iteration >= settled else min(self.max_hits, 2)
+
+    def normals_at(self, iteration: int) -> float:
+        """Factor of the normal loss at an iteration of this run: 0 before it starts."""
+        return self.losses.normals if iteration / self.iterations >= NORMALS_FROM / REFERENCE_ITERATIONS else 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as plain JSON values."""

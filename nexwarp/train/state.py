@@ -21,12 +21,11 @@ from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture, Texture
-from nexwarp.train.adam import FusedAdam
 from nexwarp.train.checkpoint import Snapshot
 from nexwarp.train.densify import DensityControl
 from nexwarp.train.initial import Start, cells_unit, given_surfels, initial_poses, initial_surfels, initial_texture
+from nexwarp.train.optimizer import FusedAdam, OptimizerMaker, make_optimizer, options_at
 from nexwarp.train.recipe import Config
-from nexwarp.train.schedules import OptimizerMaker, make_optimizer, options_at
 from nexwarp.train.settings import config_from_dict, refuse_removed
 
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too

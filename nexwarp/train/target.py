@@ -15,7 +15,6 @@ from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.render import jitter_factors
 from nexwarp.train.exposure import ExposureCalibration
 from nexwarp.train.state import TrainingState
-from nexwarp.train.surface_losses import normals_factor
 from nexwarp.train.views import TrainingViews, mean_color
 
 
@@ -96,7 +95,7 @@ class TargetSource:
         """Make the target of a step with view `index`, number `number` of the training, before the `upcoming` ones."""
         config, iteration = self.config, self.state.iteration
         target = self.with_points(self.from_view(index, upcoming), index)
-        target = dataclasses.replace(target, normals=normals_factor(config, iteration))
+        target = dataclasses.replace(target, normals=config.normals_at(iteration))
         if config.depth_jitter > 0 and config.max_hits:
             hits = config.hits_at(iteration)
             drawn = jitter_factors(target.camera, hits, config.depth_jitter, generator=self.noise)

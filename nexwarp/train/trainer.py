@@ -17,14 +17,13 @@ from nexwarp.model.model import Model
 from nexwarp.model.render import draw
 from nexwarp.train.checkpoint import Snapshot, load_checkpoint, save_checkpoint
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
-from nexwarp.train.finish.finish import FinishObserver, finish_model
-from nexwarp.train.health import Health, oom_message, watched_tensors
+from nexwarp.train.finish import FinishObserver, finish_model
 from nexwarp.train.initial import Start, check_start
+from nexwarp.train.losses import OwnLoss, as_taken, check_own_losses, step_losses
+from nexwarp.train.optimizer import OptimizerMaker, set_rates
 from nexwarp.train.recipe import Config
-from nexwarp.train.report import StepReport
-from nexwarp.train.schedules import OptimizerMaker, set_rates
+from nexwarp.train.report import StepReport, check_health, oom_message, watched_tensors
 from nexwarp.train.state import TrainingState, check_origin, check_snapshot, checkpoint_errors, scene_digest
-from nexwarp.train.step_losses import OwnLoss, as_taken, check_own_losses, step_losses
 from nexwarp.train.target import Target, refined
 from nexwarp.train.teachers import check_teachers, make_targets
 
@@ -85,7 +84,7 @@ class Trainer(TrainingState):
         self.targets = make_targets(self, calibration, models, partial(beside, self.graphs))
         self.views, self.background = self.targets.views, self.targets.background
         self.views_a_step = 1
-        self.health = Health()
+        self.noted: list[tuple[int, str, torch.Tensor]] = []  # losses since the last check
         self.good: Snapshot | None = None
 
     def run(
@@ -145,7 +144,7 @@ class Trainer(TrainingState):
         if self.iteration >= last and self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         self.seconds += time.perf_counter() - start
-        self.health.note(self.iteration, report.losses)
+        self.noted += [(self.iteration, name, value.detach()) for name, value in report.losses.items()]
         return report
 
     def step(self) -> StepReport:
@@ -233,7 +232,8 @@ class Trainer(TrainingState):
 
     def check(self) -> None:
         """Raise DivergedError unless all losses since the last check, parameters and optimizer state are finite."""
-        self.health.check(self.iteration, self._watched())
+        noted, self.noted = self.noted, []
+        check_health(self.iteration, noted, self._watched())
 
     def _watched(self) -> dict[str, torch.Tensor]:
         return watched_tensors(self._named_parameters(), self.optimizer) | {"densify.errors": self.densifier.errors}
@@ -283,7 +283,7 @@ class Trainer(TrainingState):
         super().load_snapshot(snapshot)
         if self.graphs is not None:
             self.graphs.clear()
-        self.health = Health()
+        self.noted = []
 
     @cached_property
     def origin(self) -> dict[str, str]:

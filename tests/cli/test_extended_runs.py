@@ -9,7 +9,7 @@ import pytest
 from nexwarp.cli import main as cli
 from nexwarp.data import load_scene
 from nexwarp.run.folder import read_run
-from nexwarp.train.schedules import set_rates
+from nexwarp.train.optimizer import set_rates
 from nexwarp.train.trainer import Trainer
 from tests.cli.support import read
 

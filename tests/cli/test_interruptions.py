@@ -11,8 +11,8 @@ import pytest
 
 from nexwarp.cli import main as cli
 from nexwarp.run.log import TrainingLog
-from nexwarp.train.adam import FusedAdam
 from nexwarp.train.densify import DensityControl
+from nexwarp.train.optimizer import FusedAdam
 from nexwarp.train.trainer import Trainer
 from tests.cli.support import FLAGS, RUN_FILES, read, refused, snapshot
 

@@ -11,7 +11,7 @@ from nexwarp import ops
 from nexwarp.model.render import antialiased
 from nexwarp.model.render import draw as draw_parts
 from nexwarp.model.texture import NEVER, DetailLimits
-from nexwarp.train.finish.detail_limits import measure_detail_limits
+from nexwarp.train.finish import measure_detail_limits
 from tests.render_support import BACKGROUND, MAX_HITS, assert_same
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close

@@ -29,9 +29,8 @@ from nexwarp.train.exposure import (
     observations,
     solve_gains,
 )
-from nexwarp.train.losses import photo_losses
+from nexwarp.train.losses import SATURATION, as_taken, photo_losses
 from nexwarp.train.recipe import Config, LossWeights, TextureConfig
-from nexwarp.train.step_losses import SATURATION, as_taken
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import TrainingViews, mean_color

@@ -11,7 +11,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import look_at
 from nexwarp.data import Scene, View
 from nexwarp.model.surfels import Surfels
-from nexwarp.train.finish.sh_smoothing import seen_directions, smooth_sh
+from nexwarp.train.finish import seen_directions, smooth_sh
 from nexwarp.train.recipe import MAX_STRENGTH, MIN_STRENGTH, Config, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.reference.sh import basis as sh_basis

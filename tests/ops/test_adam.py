@@ -7,8 +7,8 @@ import torch
 
 import nexwarp as nw
 from nexwarp.ops.adam import Moments, adam_step
-from nexwarp.train.adam import FusedAdam, grid_factors
 from nexwarp.train.losses import grid_loss
+from nexwarp.train.optimizer import FusedAdam, grid_factors
 from nexwarp.train.recipe import LossWeights
 from nexwarp.train.state import gather_optimizer, restore_optimizer
 from tests.tolerances import assert_close

@@ -9,8 +9,8 @@ from torch.autograd import gradcheck
 import nexwarp as nw
 from nexwarp import ops
 from nexwarp.data import Scene as Capture
+from nexwarp.train.losses import depth_normals, normal_loss
 from nexwarp.train.recipe import Config, LossWeights
-from nexwarp.train.surface_losses import depth_normals, normal_loss, normals_factor
 from nexwarp.train.trainer import Trainer
 from tests.scenes import make_camera, make_surfels, random_scene
 from tests.tolerances import assert_close
@@ -86,10 +86,10 @@ def test_normal_loss_by_its_definition(device: torch.device) -> None:
 
 def test_the_loss_starts_as_that_of_2dgs() -> None:
     config = Config(losses=LossWeights(normals=0.05))
-    assert [normals_factor(config, i) for i in (1, 6_999, 7_000, 30_000)] == [0, 0, 0.05, 0.05]
-    assert normals_factor(Config(), 30_000) == 0
+    assert [config.normals_at(i) for i in (1, 6_999, 7_000, 30_000)] == [0, 0, 0.05, 0.05]
+    assert Config().normals_at(30_000) == 0
     short = dataclasses.replace(config, iterations=100)
-    assert [normals_factor(short, i) for i in (9, 23, 24)] == [0, 0, 0.05]
+    assert [short.normals_at(i) for i in (9, 23, 24)] == [0, 0, 0.05]
 
 
 def test_a_training_has_the_loss_once_it_starts(tiny_scene: Capture) -> None:

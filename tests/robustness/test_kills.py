@@ -13,7 +13,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE
 from nexwarp.train import recipe
 from nexwarp.train.checkpoint import has_checkpoint
-from nexwarp.train.finish.finish import FinishObserver
+from nexwarp.train.finish import FinishObserver
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer

@@ -17,10 +17,10 @@ from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMe
 from nexwarp.machine import needed_memory
 from nexwarp.train import state, trainer
 from nexwarp.train.checkpoint import save_checkpoint
-from nexwarp.train.health import not_finite
+from nexwarp.train.losses import step_losses
+from nexwarp.train.optimizer import make_optimizer
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
-from nexwarp.train.schedules import make_optimizer
-from nexwarp.train.step_losses import step_losses
+from nexwarp.train.report import not_finite
 from nexwarp.train.trainer import Trainer
 from tests.scene_writers import write_demo
 

@@ -17,8 +17,8 @@ from nexwarp.run.evaluate import evaluate
 from nexwarp.run.fit_poses import fit_poses
 from nexwarp.train import recipe
 from nexwarp.train.initial import initial_poses
+from nexwarp.train.optimizer import rate_ends
 from nexwarp.train.recipe import DEMO_SETTINGS, DensifyConfig, LearningRates, preset
-from nexwarp.train.schedules import rate_ends
 from nexwarp.train.settings import with_settings
 from nexwarp.train.trainer import Trainer
 from nexwarp.train.views import with_cameras

@@ -14,9 +14,8 @@ import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene
 from nexwarp.errors import CheckpointError
-from nexwarp.train.adam import ParameterGroup
+from nexwarp.train.optimizer import OptimizerMaker, ParameterGroup
 from nexwarp.train.recipe import DensifyConfig, TextureConfig
-from nexwarp.train.schedules import OptimizerMaker
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 

@@ -1,4 +1,4 @@
-"""SH smoothing: makes a surfel's colour smooth in directions that no training view has. Not in the paper.
+"""From trained surfels to a finished model: SH smoothing and detail limits. Neither is in the paper.
 
 A surfel's SH are trained only in the directions of the photos that show it, often few and close to each other. In other
 directions the colour is arbitrary, and with degree 3 it can become pink or green. After training, a ridge regression
@@ -11,17 +11,91 @@ that view; Y the harmonics, before colours are clamped to >= 0; and D the Laplac
 l, divided by that of degree 3. The colours in the training views change little; all others become as even as possible.
 """
 
-from collections.abc import Callable, Sequence
+import copy
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from typing import TypeVar
 
 import torch
 
 from nexwarp import ops
+from nexwarp.cameras.camera import Camera
 from nexwarp.data import View
+from nexwarp.kernels.types import ALPHA_MIN
+from nexwarp.machine import deterministic
+from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
+from nexwarp.model.surfels import Surfels
+from nexwarp.model.texture import NEVER, DetailLimits
+from nexwarp.train.recipe import Config
+from nexwarp.train.views import with_cameras
 
 PRODUCTS = 2**26  # values of the normal equations held at once, float64: 0.5 GiB
 SOLVED = 2**21  # values of the matrices solved at once, several times
 LEAST = 1e-6  # least sum of weights over all views, in pixels, of a surfel that is seen
+FinishObserver = Callable[[str, int, int], None]
+Item = TypeVar("Item")
+
+
+def finish_model(
+    model: Model,
+    views: Sequence[View],
+    cameras: Sequence[Camera],
+    exposures: Exposures | None,
+    config: Config,
+    observe: FinishObserver = lambda *_: None,
+) -> Model:
+    """Return a finished model with surfels of its own: smooth SH, detail limits and exposures.
+
+    The texture is shared. `cameras` are those of the training views as their poses are corrected, on the model's
+    device. `observe` is called with each stage's name, how many views of it are rendered, and of how many.
+    """
+    raw = {name: value.detach().clone() for name, value in model.surfels.state_dict().items()}
+    finished = Model(Surfels(raw), model.texture, options=model.options)
+    if config.smooth_sh > 0:
+        # Detail limits are the same whatever the order of threads.
+        with deterministic(config.deterministic and model.device.type == "cuda"):
+            seen_from = with_cameras(views, cameras)
+            sh0, shN = smooth_sh(finished, seen_from, config.smooth_sh, partial(observe, "smoothing SH"))
+        finished.surfels.sh0.data, finished.surfels.shN.data = sh0, shN
+    if config.footprints:
+        seen = counted(cameras, "measuring detail limits", observe)
+        finished.detail_limits = measure_detail_limits(finished, seen)
+    if exposures is not None:
+        finished.exposures = copy.deepcopy(exposures).to(model.device)
+    finished.meta = model.meta | {"smooth_sh": config.smooth_sh}
+    return finished
+
+
+def counted(items: Sequence[Item], stage: str, observe: FinishObserver) -> Iterator[Item]:
+    """Yield items, each of which is done when the next one is asked for."""
+    for done, item in enumerate(items, 1):
+        yield item
+        observe(stage, done, len(items))
+
+
+@torch.no_grad()
+def measure_detail_limits(model: Model, cameras: Iterable[Camera]) -> DetailLimits:
+    """Return the detail limits of a model's surfels: the pixel sizes (depth / focal) at which cameras saw them."""
+    bare = model.bare(max_hits=max(model.options.max_hits, 1))
+    surfels = bare.surfels
+    nearest = surfels.means.new_full((len(surfels),), NEVER)
+    if not len(surfels):
+        return DetailLimits(nearest, nearest.clone())
+    farthest, front = torch.zeros_like(nearest), torch.zeros_like(nearest)
+    for camera in cameras:
+        camera = camera.to(surfels.device)
+        out = bare.render(camera)
+        seen, ids = out.weights >= ALPHA_MIN, out.ids.clamp_min(0).long()
+        centres = camera.project(surfels.means)[1]
+        front = torch.maximum(front, centres.where(centres > camera.near, 0.0) / camera.focal)
+        near = (out.depths / camera.focal).where(seen, NEVER)
+        far = (torch.maximum(out.depths, centres[ids]) / camera.focal).where(seen, 0.0)
+        nearest.scatter_reduce_(0, ids.flatten(), near.flatten(), "amin")
+        farthest.scatter_reduce_(0, ids.flatten(), far.flatten(), "amax")
+    # Surfels without a visible texture have the limit of their centres in the views that they are in front of.
+    farthest = farthest.where(farthest > 0, front)
+    return DetailLimits(nearest, farthest.where(farthest > 0, NEVER))
 
 
 @torch.no_grad()

@@ -1,1 +1,0 @@
-"""From trained surfels to a finished model."""
