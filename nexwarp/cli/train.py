@@ -1,7 +1,8 @@
 """`nexwarp train`."""
 
 import dataclasses
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -124,10 +125,8 @@ class Train:
                 is_ply = record.init.suffix == PLY
                 start = {"surfels": Surfels.load(record.init)} if is_ply else {"init": load(record.init)}
             scene = _load_scene(record, ranks, console)
-            try:
+            with _naming("--init"):
                 check_start(scene, record.config, start)
-            except ValueError as error:
-                raise SettingError(f"--init: {error}") from None
             if not resume:
                 config = record.config
                 if scene.background is not None:
@@ -144,7 +143,11 @@ class Train:
                 scene, record.config, ranks.device, session, own=record.own, ranks=ranks, teachers=teachers, **start
             )
             if ranks.first and resume:
-                _tell_extension(run, record.config, console)
+                before, after = read_run(run).config.iterations, record.config.iterations
+                if after > before:
+                    text = "learning rates, density control and all other schedules are those of a run of that length"
+                    text = f"extended from {before:,} to {after:,} iterations: from here on, {text}"
+                    console.print(text, soft_wrap=True)
                 update_run(run, record)
             elif ranks.first:
                 check_teachers_place(run, record.own.count)
@@ -201,7 +204,9 @@ class Train:
         base = preset(self.preset)
         if self.scene.path == DEMO:
             base = with_settings(base, DEMO_SETTINGS)
-        return _with_set(with_settings(base, flags), settings)
+        base = with_settings(base, flags)
+        with _naming("--set"):
+            return with_settings(base, settings)
 
     def _settings(self) -> tuple[dict[str, Json], dict[str, Json]]:
         """Return the settings that are given as options of their own, and those of --set, which must be others."""
@@ -215,10 +220,8 @@ class Train:
             "refine_poses": self.refine_poses or None,
         }
         flags = {name: value for name, value in flags.items() if value is not None}
-        try:
+        with _naming("--set"):
             settings = parse_settings(self.settings)
-        except ValueError as error:
-            raise SettingError(f"--set: {error}") from None
         for name in settings:
             if name == "preset" or name in flags:
                 raise SettingError(f"--set: {name}: expected {_flag(name)} instead of --set")
@@ -235,7 +238,9 @@ class Train:
         if self.preset != "default" or "--preset" in self.given:
             _check_same("--preset", old.config.preset, self.preset)
         config = old.config
-        changed = _with_set(with_settings(config, flags), settings)
+        changed = with_settings(config, flags)
+        with _naming("--set"):
+            changed = with_settings(changed, settings)
         for name in (*flags, *settings):
             value = setting(changed, name)
             # The second one does not change the results.
@@ -307,12 +312,13 @@ def _check_same(what: str, expected: object, given: object) -> None:
         raise SettingError(f"{what}: expected {expected} as in the run to resume, got {given}")
 
 
-def _with_set(config: Config, settings: dict[str, Json]) -> Config:
-    """Return a config with the settings of --set; a SettingError names --set."""
+@contextmanager
+def _naming(flag: str) -> Iterator[None]:
+    """Raise a ValueError of the block as a SettingError that names an option."""
     try:
-        return with_settings(config, settings)
+        yield
     except ValueError as error:
-        raise SettingError(f"--set: {error}") from None
+        raise SettingError(f"{flag}: {error}") from None
 
 
 def _load_scene(record: RunRecord, ranks: Ranks, console: Console) -> Scene:
@@ -327,14 +333,3 @@ def _load_scene(record: RunRecord, ranks: Ranks, console: Console) -> Scene:
         f"{len(scene.points):,} points"
     )
     return scene
-
-
-def _tell_extension(run: Path, config: Config, console: Console) -> None:
-    """Say what a larger --iterations does to the run to resume."""
-    before = read_run(run).config.iterations
-    if config.iterations > before:
-        console.print(
-            f"extended from {before:,} to {config.iterations:,} iterations: from here on, learning rates, "
-            "density control and all other schedules are those of a run of that length",
-            soft_wrap=True,
-        )

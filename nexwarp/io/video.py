@@ -152,24 +152,18 @@ def frame_pixels(frame: "av.VideoFrame") -> np.ndarray:
     Matrix and range are the frame's; a frame without is BT.709 from 720 lines or 1280 columns on, else BT.601. HDR (HLG
     and PQ) is converted so that its reference white, 203 nits, becomes white; what is brighter is clipped.
     """
+    converted = frame
     if frame.color_trc in HDR:
-        return _upright(frame, _to_sdr(frame).to_ndarray(format="rgb24"))
-    if frame.colorspace == UNSPECIFIED and "yuv" in frame.format.name:
+        if frame.colorspace == UNSPECIFIED:
+            frame.colorspace = BT2020
+        if frame.color_primaries == UNSPECIFIED:
+            frame.color_primaries = BT2020
+        graph = _hdr_graph(frame.width, frame.height, frame.format.name, frame.color_trc)
+        graph.push(frame)
+        converted = cast("av.VideoFrame", graph.pull())  # of 16 bits a channel
+    elif frame.colorspace == UNSPECIFIED and "yuv" in frame.format.name:
         frame.colorspace = BT709 if frame.height >= HD[0] or frame.width >= HD[1] else BT601
-    return _upright(frame, frame.to_ndarray(format="rgb24"))
-
-
-def _to_sdr(frame: "av.VideoFrame") -> "av.VideoFrame":
-    """Convert an HDR frame to sRGB with 16 bits a channel."""
-    if frame.colorspace == UNSPECIFIED:
-        frame.colorspace = BT2020
-    if frame.color_primaries == UNSPECIFIED:
-        frame.color_primaries = BT2020
-    graph = _hdr_graph(frame.width, frame.height, frame.format.name, frame.color_trc)
-    graph.push(frame)
-    converted = graph.pull()
-    assert not isinstance(converted, bytes)
-    return cast("av.VideoFrame", converted)
+    return _upright(frame, converted.to_ndarray(format="rgb24"))
 
 
 @lru_cache(maxsize=1)  # building its tables takes seconds

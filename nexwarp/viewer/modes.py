@@ -98,10 +98,15 @@ def _values(out: Rendering, surfels: Surfels, camera: Camera, settings: Settings
     if mode in ("weights", "depth"):
         values = out.weights if mode == "weights" else out.depths
         return values[..., slot].masked_fill(ids < 0, torch.nan)
-    if mode == "ids" or len(surfels) == 0:
-        return id_colours(ids) * (ids >= 0)[..., None]
-    normals = facing_normals(surfels, camera.position)[ids.clamp_min(0)]
-    return (normals * 0.5 + 0.5) * (ids >= 0)[..., None]
+    if mode == "ids" or len(surfels) == 0:  # three multiplicative hashes, each channel at least 0.2
+        factors = ids.new_tensor([2654435761, 2246822519, 3266489917])
+        hashes = ((ids[..., None] + 1) * factors) % 2**32 // 2**16 % 256
+        colours = 0.2 + 0.8 * hashes.float() / 255.0
+    else:
+        normals = surfels.normals
+        behind = ((surfels.means - camera.position) * normals).sum(dim=-1, keepdim=True) > 0
+        colours = torch.where(behind, -normals, normals)[ids.clamp_min(0)] * 0.5 + 0.5
+    return colours * (ids >= 0)[..., None]
 
 
 def _pixels(values: torch.Tensor, span: tuple[float, float] | None) -> np.ndarray:
@@ -113,13 +118,6 @@ def _pixels(values: torch.Tensor, span: tuple[float, float] | None) -> np.ndarra
     return (values.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
 
 
-def facing_normals(surfels: Surfels, position: torch.Tensor) -> torch.Tensor:
-    """Return (N, 3) unit normals in the world frame that face `position`."""
-    normals = surfels.normals
-    behind = ((surfels.means - position) * normals).sum(dim=-1, keepdim=True) > 0
-    return torch.where(behind, -normals, normals)
-
-
 def _depth_span(depths: torch.Tensor) -> tuple[float, float]:
     """Return the 2nd and 98th percentile of depths (n,), from a sample of at most twice `QUANTILE_SAMPLES`."""
     if depths.numel() == 0:
@@ -127,10 +125,3 @@ def _depth_span(depths: torch.Tensor) -> tuple[float, float]:
     sample = depths[:: max(depths.numel() // QUANTILE_SAMPLES, 1)]
     low, high = torch.quantile(sample, sample.new_tensor([0.02, 0.98])).tolist()
     return low, max(high, low + 1e-6 * max(abs(low), 1e-6))
-
-
-def id_colours(ids: torch.Tensor) -> torch.Tensor:
-    """Return colours (..., 3) of integers by three multiplicative hashes, each channel at least 0.2."""
-    factors = ids.new_tensor([2654435761, 2246822519, 3266489917])
-    hashes = ((ids[..., None] + 1) * factors) % 2**32 // 2**16 % 256
-    return 0.2 + 0.8 * hashes.float() / 255.0

@@ -99,31 +99,31 @@ class Access:
             scheme, _, own = origin.partition("://")
             if len(origins) > 1 or scheme != "http" or authority(own) != host:
                 return "the request comes from a page of another server: expected the viewer's own page"
-        cookies = (pair.strip().partition("=") for line in headers.get_all("Cookie") for pair in line.split(";"))
-        tokens = [_query_token(target), *(value for name, _, value in cookies if name == _cookie_name(host[1]))]
-        if self.token and not any(self._is_token(token) for token in tokens):
+        cookies = (pair.strip() for line in headers.get_all("Cookie") for pair in line.split(";"))
+        kept = f"{_cookie_name(host[1])}={self.token}"
+        if self.token and not (self._in_url(target) or any(_same(cookie, kept) for cookie in cookies)):
             return "the viewer needs its token: open the address with ?token=, as nexwarp has printed it"
         return None
 
     def cookie(self, target: str, headers: Headers) -> str | None:
         """Return the cookie for the response to an admitted page request with the token in its URL; else None."""
         host = authority(headers.get_all("Host")[0])
-        if not self.token or host is None or not self._is_token(_query_token(target)):
+        if not self.token or host is None or not self._in_url(target):
             return None
         return f"{_cookie_name(host[1])}={self.token}; Path=/; HttpOnly; SameSite=Strict"
 
-    def _is_token(self, text: str) -> bool:
-        """Compare in constant time."""
-        return hmac.compare_digest(text.encode("utf-8", "surrogateescape"), self.token.encode())
+    def _in_url(self, target: str) -> bool:
+        return _same(parse_qs(target.partition("?")[2]).get("token", [""])[0], self.token)
+
+
+def _same(text: str, secret: str) -> bool:
+    """Compare in constant time."""
+    return hmac.compare_digest(text.encode("utf-8", "surrogateescape"), secret.encode())
 
 
 def _cookie_name(port: int) -> str:
     """Cookies of a host are shared by its ports; each viewer has one of its own."""
     return f"nexwarp_{port}"
-
-
-def _query_token(target: str) -> str:
-    return parse_qs(target.partition("?")[2]).get("token", [""])[0]
 
 
 class Gate:

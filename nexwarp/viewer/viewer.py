@@ -90,9 +90,6 @@ class Viewer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
         """Disconnect all browsers and stop the server."""
         for session in list(self.sessions.values()):
             session.closed.set()
@@ -121,23 +118,20 @@ class Viewer:
         self.step = step
         if self.training is None or not (self.sessions or self.training.paused):
             return
+        training, now = self.training, time.perf_counter()
         try:
-            self._serve(self.training, describe, stop)
+            if self.share.due(now):
+                training.tell(self.step, describe, now)
+                seconds = self._draw_next(pacing.TRAINING_SECONDS)
+                if seconds is not None:
+                    self.share.spend(time.perf_counter(), seconds)
+            if training.paused:
+                training.tell(self.step, describe, now, force=True)
+                while training.paused and not stop():
+                    self._draw_or_wait()
         except Exception as error:  # for example out of memory
             log.warning("the viewer failed: %s", _reason(error))
             self.share.spend(time.perf_counter(), pacing.FIRST_SECONDS)
-
-    def _serve(self, training: TrainingPanel, describe: Callable[[], str], stop: Callable[[], bool]) -> None:
-        now = time.perf_counter()
-        if self.share.due(now):
-            training.tell(self.step, describe, now)
-            seconds = self._draw_next(pacing.TRAINING_SECONDS)
-            if seconds is not None:
-                self.share.spend(time.perf_counter(), seconds)
-        if training.paused:
-            training.tell(self.step, describe, now, force=True)
-            while training.paused and not stop():
-                self._draw_or_wait()
 
     def finish(self, text: str, model: Callable[[], Model]) -> None:
         """End the training's display with a status line, and show another model from now on."""

@@ -13,12 +13,11 @@ from __future__ import annotations
 
 import builtins
 import io
+import itertools
 import json
 import os
 import random
 import shutil
-import stat
-import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -97,10 +96,8 @@ class Recorder:
         self.root = root
         self.operations: list[Operation] = []
         self.folders: set[int] = set()
-        self._nodes: dict[int, int] = {}  # by inode, which a later file may get anew
-        self._count = ROOT
-        self._thread = threading.get_ident()
-        self._nodes[root.stat().st_ino] = ROOT
+        self._numbers = itertools.count(ROOT + 1)
+        self._nodes = {root.stat().st_ino: ROOT}  # by inode, which a later file may get anew
         self.start = self._last = self._scan()
 
     def allow(self, run: set[int | None], checkpoint: Numbers, model: Numbers) -> None:
@@ -129,33 +126,28 @@ class Recorder:
             self.operations.append(("synced", node, None))
 
     def _scan(self) -> Tree:
-        tree, seen = Tree(), {self.root.stat().st_ino}
-        self._scan_folder(self.root, ROOT, tree, seen)
-        self._nodes = {inode: node for inode, node in self._nodes.items() if inode in seen}
+        tree, seen = Tree(), {self.root.stat().st_ino: ROOT}
+
+        def node(path: str) -> int:
+            inode = os.stat(path).st_ino
+            if inode not in seen:
+                seen[inode] = self._nodes[inode] if inode in self._nodes else next(self._numbers)
+            return seen[inode]
+
+        for place, folders, names in os.walk(self.root):
+            entries = {name: node(os.path.join(place, name)) for name in (*folders, *names)}
+            tree.folders[node(place)] = {**entries}
+            for name in names:
+                with _open(os.path.join(place, name), "rb") as file:
+                    tree.files[entries[name]] = file.read()
+        self._nodes = seen
         self.folders |= tree.folders.keys()
         return tree
 
-    def _scan_folder(self, folder: Path, node: int, tree: Tree, seen: set[int]) -> None:
-        entries = tree.folders[node] = {}
-        for name in sorted(os.listdir(folder)):
-            status = (folder / name).stat()
-            seen.add(status.st_ino)
-            if status.st_ino not in self._nodes:
-                self._count += 1
-                self._nodes[status.st_ino] = self._count
-            inner = entries[name] = self._nodes[status.st_ino]
-            if stat.S_ISDIR(status.st_mode):
-                self._scan_folder(folder / name, inner, tree, seen)
-            else:
-                with _open(folder / name, "rb") as file:
-                    tree.files[inner] = file.read()
-
     def recorded(self, original: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that looks before each of its calls in this thread."""
+        """Return a function that looks before each of its calls."""
 
         def call(*args: Any, **kwargs: Any) -> Any:
-            if threading.get_ident() != self._thread:
-                return original(*args, **kwargs)
             self.look()
             return original(*args, **kwargs)
 
@@ -216,9 +208,8 @@ def _surviving(versions: list[bytes], chance: random.Random) -> bytes:
         return versions[i]
     old, new = versions[i], versions[i + 1]
     place = chance.randint(0, len(new))
-    return chance.choice(
-        [new[:place], bytes(len(new)), new[:place] + bytes(len(new) - place), new[:place] + old[place:]]
-    )
+    rest = chance.choice((b"", bytes(len(new) - place), old[place:]))
+    return chance.choice((new[:place] + rest, bytes(len(new))))
 
 
 def found_in(root: Path) -> list[Any]:
