@@ -10,9 +10,7 @@ import nexwarp as nw
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.buffers import Buffers, load_buffers, render_buffers, save_buffers
 from nexwarp.model.texture import DetailLimits
-from tests.reference.collect import camera_rays, pixel_centers, rotations
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
-from tests.tolerances import FLIPS, assert_close
 
 BACKGROUND = (0.3, 0.9, 0.1)
 PASSES = [f.name for f in fields(Buffers) if f.name not in ("camera", "background")]
@@ -78,62 +76,6 @@ def test_file_holds_named_channels(tmp_path: Path) -> None:
         "ids.1": {"Y": np.uint32},
     }
     assert ((ids == 2**32 - 1) == (buffers.ids[..., 1] == -1).numpy()).all()
-
-
-def test_expected_depth_is_the_mean_over_all_hits(device: torch.device) -> None:
-    """Of a scene of 8 surfels at most 8 are hit: the buffers of K = 8 hold all of them. K does not matter."""
-    full = make(count=8, max_hits=8, device=device)
-    total = full.weights.double().sum(-1)
-    expected = (full.weights.double() * full.depths).sum(-1) / total.clamp_min(1e-30)
-    assert_close(full.expected_depth, expected, kind="value", name="expected_depth")
-    missed = total == 0
-    assert missed.any()
-    for name in ("expected_depth", "median_depth", "top_depth", "normals"):
-        assert (getattr(full, name)[missed] == 0).all(), name
-    # All hits' weights: nothing is missing from the mean.
-    assert_close(full.weights.sum(-1), full.alpha, kind="value", name="weights")
-    for max_hits in (0, 1, 2):
-        fewer = make(count=8, max_hits=max_hits, device=device)
-        for name in ("expected_depth", "median_depth", "normals"):
-            assert getattr(fewer, name).equal(getattr(full, name)), name
-        # Another kernel computes the same depth, which CUDA's fast math may round otherwise.
-        assert_close(fewer.top_depth, full.depths[..., 0], kind="value", name="top_depth")
-
-
-def test_median_depth_is_where_half_of_the_light_is_left(device: torch.device) -> None:
-    """Hits are blended in the order of their surfels' centres; the first that leaves at most half is the median's."""
-    scene = random_scene(8, device=device)
-    full = make(count=8, max_hits=8, device=device)
-    viewmat = scene["viewmat"].double()
-    centres = scene["means"].double() @ viewmat[2, :3] + viewmat[2, 3]
-    order = torch.where(full.ids >= 0, centres[full.ids.clamp_min(0).long()], torch.inf).argsort(dim=-1, stable=True)
-    weights, depths = (x.gather(-1, order).double() for x in (full.weights, full.depths))
-    left = 1 - weights.cumsum(-1) + weights  # transmittance before each hit
-    last = ((left > 0.5) & (weights > 0)).sum(-1, keepdim=True) - 1
-    hit = last[..., 0] >= 0
-    expected = torch.where(hit, depths.gather(-1, last.clamp_min(0))[..., 0], 0.0)
-    assert 0.1 < (full.alpha > 0.5).double().mean() < 0.9 and ((last > 0) & (full.alpha > 0.5)[..., None]).any()
-    assert_close(full.median_depth, expected, kind="value", name="median_depth", allow_flips=FLIPS)
-
-
-def test_normals_are_the_mean_over_all_hits_and_face_the_camera(device: torch.device) -> None:
-    """Each hit's normal counts by its weight, on the side that its ray comes from."""
-    scene = random_scene(8, device=device)
-    full = make(count=8, max_hits=8, device=device)
-    there = full.ids >= 0
-    hit = there.any(-1)
-    axes = rotations(scene["quats"].double())[..., 2]
-    own = axes[full.ids.clamp_min(0).long()]
-    viewmat = scene["viewmat"].double()
-    intrinsics = (scene["K"][0, 0], scene["K"][1, 1], scene["K"][0, 2], scene["K"][1, 2])
-    pixels = pixel_centers(scene["width"], scene["height"], viewmat)
-    rays = (camera_rays(pixels, *intrinsics) @ viewmat[:3, :3]).view(*hit.shape, 3)
-    facing = torch.where((own * rays[:, :, None]).sum(-1, keepdim=True) > 0, -own, own)
-    assert (facing != own).any() and (facing == own).any()
-    expected = torch.nn.functional.normalize((full.weights.double()[..., None] * facing).sum(2), dim=-1)
-    assert_close(full.normals[hit], expected[hit], kind="value", name="normals")
-    assert ((full.normals * rays).sum(-1)[hit] < 0).all()
-    assert ((full.normals.norm(dim=-1)[hit] - 1).abs() < 1e-5).all()
 
 
 def test_bad_files_are_refused(tmp_path: Path) -> None:

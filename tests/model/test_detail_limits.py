@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any
 
-import pytest
 import torch
 
 import nexwarp as nw
@@ -177,14 +176,3 @@ def test_no_surfels_have_no_limits(device: torch.device) -> None:
     assert found.nearest.shape == found.farthest.shape == (0,)
     out = limited(surfels, make_texture(device=device), camera, found, background=BACKGROUND)
     assert (out.image - torch.tensor(BACKGROUND, device=device)).abs().max() < 1e-6
-
-
-def test_limits_of_other_surfels_are_named() -> None:
-    scene = random_scene(5)
-    surfels, camera = make_surfels(scene), make_camera(scene)
-    with pytest.raises(ValueError, match=r"^detail_limits\.nearest: expected shape \(5,?\), got \(4,\)$"):
-        limited(surfels, None, camera, DetailLimits(torch.ones(4), torch.ones(4)))
-    with pytest.raises(ValueError, match=r"^detail_limits: expected limits of 5 surfels, got 4$"):
-        nw.Model(surfels, None, detail_limits=DetailLimits(torch.ones(4), torch.ones(4)))
-    with pytest.raises(ValueError, match=r"^farthest: expected shape \(N=5\), got \(4,\)$"):
-        DetailLimits(torch.ones(5), torch.ones(4))

@@ -1,7 +1,6 @@
 """Exposures of photos: found where points tell them, given to cameras between, and no business of the rest."""
 
 import dataclasses
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ from nexwarp.train.losses import SATURATION, as_taken, photo_losses
 from nexwarp.train.recipe import Config, LossWeights, TextureConfig
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
-from nexwarp.train.views import TrainingViews, mean_color
+from nexwarp.train.views import mean_color
 from tests.narrowing import present
 from tests.scene_writers import exposure_at, with_exposures, write_demo
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
@@ -130,16 +129,6 @@ def test_the_falloff_of_the_lens_is_found(lens):
     expected = light(camera, torch.stack([column, row], -1).reshape(-1, 2), lens).reshape(48, 64, 1)
     assert expected.min() < 0.85
     assert (present(exposures.falloff_of(camera)) / expected - 1).abs().max() < 0.01
-
-
-def test_exposures_can_be_pickled_and_loaded_into():
-    """As `torch.save` of a model and a process that is spawned do; a copy reads the falloff that it loads."""
-    cameras = [looking(0.0), looking(1.0)]
-    exposures = Exposures.of(torch.tensor([[0.1] * 3, [-0.1] * 3]), cameras, (-0.2, -0.1, 0.25))
-    copied = pickle.loads(pickle.dumps(exposures))
-    assert torch.equal(copied.gains(cameras[1]), exposures.gains(cameras[1]))
-    copied.load_state_dict(Exposures.of(torch.zeros(2, 3), cameras, (-0.3, -0.2, 0.4)).state_dict())
-    assert copied.lens == pytest.approx((-0.3, -0.2, 0.4))
 
 
 def test_the_falloff_is_the_angle_s():
@@ -291,21 +280,6 @@ def test_a_rendering_is_times_its_gains(tmp_path, device: torch.device, falloff)
     assert_close(total, buffers.image, kind="value", name="sum")
     slots = (buffers.weights[..., None] * buffers.colors).sum(2)
     assert_close(slots, buffers.textured, kind="value", name="sum over the slots")
-
-
-def test_renderings_are_brought_to_the_photo_s_exposure():
-    """Photos stay as they are."""
-    camera = looking(0.0)
-    image = torch.randint(0, 256, (48, 64, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
-    views = [View(camera, image, None, name) for name in "ab"]
-    gains = torch.tensor([[0.5, 1.0, 2.0], [1.0, 1.0, 1.0]])
-    plain = TrainingViews(views, torch.device("cpu"))
-    mine = TrainingViews(views, torch.device("cpu"), gains)
-    assert plain.exposure(0) is None and torch.equal(present(mine.exposure(0)), gains[0])
-    assert torch.equal(mine.get(0)[1], image / 255.0)
-    lens = Exposures.of(gains.log(), [camera, camera], (-0.3, -0.2, 0.4))
-    dark = TrainingViews(views, torch.device("cpu"), gains, lens)
-    torch.testing.assert_close(present(dark.exposure(0)), gains[0] * present(lens.falloff_of(camera)))
 
 
 def test_brighter_than_a_saturated_pixel_is_no_error():

@@ -2,23 +2,19 @@
 
 import copy
 import gc
-import pickle
 import threading
 import weakref
 from collections.abc import Callable
-from contextlib import nullcontext
 from typing import Any
 
 import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import ops
 from nexwarp.cameras.camera import StagedCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.model import graphs as frames
 from nexwarp.model.exposures import Exposures
-from nexwarp.model.graphs import Frame
 from nexwarp.model.render import Rendering, draw
 from tests.narrowing import neural, present
 from tests.render_support import BUFFERS, assert_same
@@ -93,38 +89,6 @@ def test_a_cpu_has_no_graphs() -> None:
         outs = [model.render(camera) for camera in cameras("cpu") for _ in range(3)]
     assert model.surfels not in frames._graphs
     assert not any(isinstance(out, frames.CapturedRendering) for out in outs)
-
-
-@pytest.mark.filterwarnings("ignore:You are using `torch.load`:FutureWarning")  # torch 2.4.0 unpickles with it
-def test_buffers_are_copied_when_they_are_asked_for() -> None:
-    """With a stand-in for the graph: what it overwrites later does not show."""
-    model, camera = finished("cpu"), cameras("cpu")[0]
-    with torch.no_grad():
-        result, expected = model.render(camera), model.render(camera)
-
-    class Graphs:
-        lock = threading.RLock()
-        using = nullcontext
-
-    class Frame:
-        graphs = Graphs()
-
-    frame: Any = Frame()
-    stream: Any = None
-    frame.result = result
-    out, same, deep = (frames.CapturedRendering.of(frame, result.image.clone(), stream) for _ in range(3))
-    assert out.ids is not result.ids and "depths" in vars(out) and "depths" not in vars(same)
-    assert out.ids is out.intermediates.hits.ids
-    same.take_buffers()
-    copies = [copy.deepcopy(deep), pickle.loads(pickle.dumps(copy.copy(deep).image))]
-    for name in BUFFERS:
-        getattr(result, name).zero_()
-    result.intermediates.projection.records.zero_()
-    for found in (out, same, copies[0]):
-        assert_same(found, expected, (*BUFFERS, "ids", *LATER))
-    assert torch.equal(copies[1], expected.image)
-    with pytest.raises(AttributeError, match="'CapturedRendering' object has no attribute 'depth'"):
-        _ = out.depth
 
 
 @CUDA
@@ -223,83 +187,6 @@ def test_models_that_share_graphs_take_less_memory_and_keep_their_own_pictures()
     assert_same(held, whole, (*BUFFERS, "ids", *LATER))
 
 
-@pytest.fixture
-def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, int]]:
-    """Frame graphs without a GPU: what is captured is noted, as (whole, width)."""
-    captured: list[tuple[bool, int]] = []
-
-    class Captured:
-        def __init__(self, graphs: frames.FrameGraphs, frame: Frame, kind: tuple[Any, ...]) -> None:
-            self.state, self.kind = frame.state, kind
-            self.image, self.room, self.graph = torch.zeros(3), None, self
-            captured.append((kind[0], frame.camera.width))
-
-        def take(self, frame: Frame) -> None: ...
-
-        def replay(self) -> None: ...
-
-    class Stream:
-        def __init__(self, device: torch.device) -> None:
-            self.device = device
-
-    monkeypatch.setattr(frames, "CapturedFrame", Captured)
-    monkeypatch.setattr(torch.cuda, "Stream", Stream)
-    monkeypatch.setattr(frames.FrameGraphs, "using", nullcontext)
-    monkeypatch.setattr(ops, "held", lambda _: True)
-    monkeypatch.setattr(torch.cuda, "Event", object)
-    monkeypatch.setattr(torch.cuda, "current_stream", Stream)
-    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: None)
-    monkeypatch.setattr(frames, "_can_capture", lambda *_: True)
-    monkeypatch.setattr(frames, "_graphs", weakref.WeakKeyDictionary())
-    return captured
-
-
-def request_of(model: nw.Model, width: int = 61) -> Frame:
-    camera = cameras("cpu", 1, width=width)[0]
-    return model._frame(camera, None, {})
-
-
-def share(models: list[nw.Model]) -> frames.FrameGraphs:
-    frames.share_graphs([model.surfels for model in models])
-    (found,) = {id(graphs(model)): graphs(model) for model in models}.values()
-    return found
-
-
-def test_a_graph_that_keeps_all_buffers_gives_images_too(stand_ins: list[tuple[bool, int]]) -> None:
-    model = finished("cpu")
-    group = share([model])
-    for width in (61, 33):
-        assert group.render(request_of(model, width), False) is None
-        for _ in range(3):
-            assert group.render(request_of(model, width), False) is not None
-    assert stand_ins == [(False, 61), (False, 33)]
-    for _ in range(3):
-        group.render(request_of(model), True)
-        group.render(request_of(model), False)
-    assert stand_ins[2:] == [(True, 61)]
-    model.surfels.means = torch.nn.Parameter(model.surfels.means + 1)  # needs other graphs
-    assert group.render(request_of(model), False) is None
-    assert group.render(request_of(model), False) is not None
-    assert stand_ins[3:] == [(False, 61)]
-
-
-def test_models_that_share_graphs_have_graphs_of_their_own(stand_ins: list[tuple[bool, int]]) -> None:
-    models = [finished("cpu", seed) for seed in range(3)]
-    before = [share([model]) for model in models[:2]]
-    for group, model in zip(before, models, strict=False):
-        for _ in range(2):
-            group.render(request_of(model), True)
-        assert len(group.frames) == 1
-    group = share(models)
-    assert [len(each.frames) for each in before] == [0, 0], "graphs that nobody can drop any more stay in memory"
-    del stand_ins[:]
-    for _ in range(3):
-        for model in models:
-            for width in range(30, 30 + frames.MOST_GRAPHS):
-                group.render(request_of(model, width), False)
-    assert len(stand_ins) == len(group.frames) == 3 * frames.MOST_GRAPHS
-
-
 @CUDA
 def test_renderings_outlive_the_next_frames(model: nw.Model) -> None:
     views = cameras("cuda")
@@ -309,7 +196,11 @@ def test_renderings_outlive_the_next_frames(model: nw.Model) -> None:
         with frames.without_graphs():
             expected = [model.render(camera) for camera in views]
     assert all(isinstance(out, frames.CapturedRendering) for out in outs)
-    for out, same in zip(outs, (*expected, *expected), strict=True):
+    assert "depths" not in vars(outs[-1]), "copied before it was asked for"
+    outs.append(copy.deepcopy(outs[-1]))
+    with pytest.raises(AttributeError, match="'CapturedRendering' object has no attribute 'depth'"):
+        _ = outs[0].depth
+    for out, same in zip(outs, (*expected, *expected, expected[-1]), strict=True):
         assert_same(out, same, (*BUFFERS, "ids", *LATER))
     assert all(torch.equal(image, out.image) for image, out in zip(images, expected, strict=True))
 

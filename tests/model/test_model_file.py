@@ -1,6 +1,5 @@
 """Model files: what comes back is what went in, damage is one clear line."""
 
-import os
 import pickle
 from collections.abc import Callable
 from dataclasses import fields
@@ -15,14 +14,13 @@ from safetensors import safe_open
 import nexwarp as nw
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
-from nexwarp.model.model_file import FORMAT_VERSION, LATER_OPTIONS, MODEL_FILE, save_model
+from nexwarp.model.model_file import LATER_OPTIONS, MODEL_FILE, save_model
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.render import draw
 from nexwarp.model.texture import NEVER, DetailLimits
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from tests.model_file_support import META, OPTIONS, make_model, refused, rewrite
 from tests.scenes import make_camera, make_surfels, random_scene
-from tests.tolerances import assert_close
 
 
 class Bomb:
@@ -33,19 +31,6 @@ class Bomb:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (Path.touch, (self.marker,))
-
-
-def test_loaded_model_renders_the_same_image(tmp_path):
-    model = make_model()
-    file = save_model(tmp_path, model)
-    assert file == tmp_path / MODEL_FILE and os.listdir(tmp_path) == [MODEL_FILE]
-    first, second = nw.load(tmp_path), nw.load(file)
-    camera = make_camera(random_scene(24))
-    with torch.no_grad():
-        images = [m.render(camera).image for m in (model, first, second)]
-    assert torch.equal(images[1], images[2])
-    assert images[0].std() > 0.05
-    assert_close(images[1], images[0], kind="value", name="image", precision=torch.float16)
 
 
 @pytest.mark.parametrize("name", ["footprints", "far_footprints"])
@@ -126,13 +111,6 @@ def test_exposures_come_back_exactly(tmp_path):
         nw.load(save_model(tmp_path, model))
 
 
-def test_meta_survives(tmp_path):
-    loaded = nw.load(save_model(tmp_path, make_model()))
-    assert {name: loaded.meta[name] for name in META} == META
-    assert loaded.meta["format_version"] == FORMAT_VERSION and "COLMAP" in str(loaded.meta["frame"])
-    assert loaded.options == OPTIONS
-
-
 @pytest.mark.parametrize("changes", [{"exposure": "mean"}, {"detail_limits": False}, {"max_hits": 0}])
 def test_options_survive(tmp_path: Path, changes: dict[str, Any]) -> None:
     model = Model(make_surfels(random_scene(3)), None, options=OPTIONS.changed(**changes), meta=META)
@@ -146,44 +124,31 @@ def test_missing_model(tmp_path):
     refused(FileNotFoundError, nw.load, tmp_path / "no", names=tmp_path / "no", match="or a run folder with")
 
 
-@pytest.mark.parametrize("content", [b"", b"not a model at all", b"\xff" * 64, b"{}" * 100])
-def test_file_of_another_kind(tmp_path, content):
-    (tmp_path / MODEL_FILE).write_bytes(content)
-    refused(ValueError, nw.load, tmp_path, names=tmp_path / MODEL_FILE, match="expected a safetensors file")
-
-
-@pytest.mark.parametrize("share", [0.01, 0.5, 0.999])
-def test_truncated_model(tmp_path, share):
+def test_files_of_another_kind(tmp_path):
     file = save_model(tmp_path, make_model())
     whole = file.read_bytes()
-    file.write_bytes(whole[: int(share * len(whole))])
-    refused(ValueError, nw.load, file, names=file, match="expected a safetensors file")
-
-
-def test_safetensors_of_another_program(tmp_path):
-    file = tmp_path / MODEL_FILE
-    safetensors.torch.save_file({"x": torch.zeros(3)}, file)
-    refused(ValueError, nw.load, file, names=file, match="no nexwarp metadata")
-
-
-@pytest.mark.parametrize("header", ["{", "[]", "3", '"text"'])
-def test_damaged_metadata(tmp_path, header):
-    file = tmp_path / MODEL_FILE
-    safetensors.torch.save_file({"x": torch.zeros(3)}, file, {"nexwarp": header})
-    refused(ValueError, nw.load, file, names=file, match="metadata")
-
-
-@pytest.mark.parametrize("name", ["surfels.means", "surfels.shN", "texture.grid", "texture.mlp.0.weight"])
-def test_missing_tensor(tmp_path, name):
-    file = save_model(tmp_path, make_model())
-    rewrite(file, lambda tensors, _: tensors.pop(name))
-    refused(ValueError, nw.load, file, names=file, match=name.split(".")[1])
+    for content in (
+        b"",
+        b"not a model at all",
+        b"\xff" * 64,
+        b"{}" * 100,
+        whole[:99],
+        whole[: len(whole) // 2],
+        whole[:-9],
+    ):
+        file.write_bytes(content)
+        refused(ValueError, nw.load, tmp_path, names=file, match="expected a safetensors file")
+    for header in (None, "{", "[]", "3", '"text"'):
+        safetensors.torch.save_file({"x": torch.zeros(3)}, file, header and {"nexwarp": header})
+        refused(ValueError, nw.load, file, names=file, match="metadata")
 
 
 @pytest.mark.parametrize("name", ["surfels.means", "surfels.raw_gammas", "texture.grid", "texture.mlp.2.weight"])
-def test_tensors_that_do_not_fit(tmp_path, name):
+def test_tensors_that_are_missing_or_do_not_fit(tmp_path, name):
     file = save_model(tmp_path, make_model())
     rewrite(file, lambda tensors, _: tensors.update({name: tensors[name][..., :1].contiguous()}))
+    refused(ValueError, nw.load, file, names=file, match=name.split(".")[1])
+    rewrite(file, lambda tensors, _: tensors.pop(name))
     refused(ValueError, nw.load, file, names=file, match=name.split(".")[1])
 
 

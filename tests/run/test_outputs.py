@@ -23,8 +23,7 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
 from nexwarp.model.options import RenderOptions
-from nexwarp.run.folder import RunRecord, create_run, open_model
-from nexwarp.run.render import RenderOrder
+from nexwarp.run.folder import RunRecord, create_run
 from nexwarp.train.recipe import Config
 from tests.cameras.test_paths import ring
 from tests.data.inputs import room
@@ -95,7 +94,7 @@ def test_sizes(run: Path) -> None:
         assert picture(run / "renders" / "test" / "a.png").equal(rendered(run, resized(camera, *size)))
 
 
-def test_one_exposure_for_all_or_that_of_the_photos(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_tells_the_range_of_exposures(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cameras = load_cameras(run / "cameras.json")
     model = nw.load(run)
     log_gains = torch.tensor([[0.3, 0.0, -0.2], [0.1, 0.2, 0.1], [-0.4, -0.2, 0.1], [0.0, 0.0, 0.0]])
@@ -103,19 +102,6 @@ def test_one_exposure_for_all_or_that_of_the_photos(run: Path, capsys: pytest.Ca
     save_model(run, model)
     assert command("info", run) == 0
     assert "0.67 to 1.35 times the photos' mean" in capsys.readouterr().out
-    assert command("render", run, "--set", "test", "--buffers") == 0
-    assert torch.equal(picture(run / "renders/test/a.png"), rendered(run, cameras["test"]["a.png"]))
-    exposed = load_buffers(run / "renders/test/a.exr")
-    assert command("render", run, "--set", "test", "--buffers", "--exposure", "mean") == 0
-    mean, gains = load_buffers(run / "renders/test/a.exr"), model.exposures.gains(cameras["test"]["a.png"])
-    assert (gains - 1).abs().max() > 0.05
-    for name in ("image", "plain", "textured", "colors", "background"):
-        torch.testing.assert_close(getattr(mean, name) * gains, getattr(exposed, name), atol=1e-6, rtol=1e-5)
-    # The model of the caller is as it was.
-    order = RenderOrder(set="test", exposure="mean")
-    order.prepare(open_model(run)).render(model)
-    assert model.exposures is not None
-    assert torch.equal(picture(run / "renders/test/a.png"), to_uint8(mean.image))
 
 
 # Paths

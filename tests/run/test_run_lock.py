@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 HOLD = """
 import os, sys, time
 from pathlib import Path
-from nexwarp.run import folder
+from nexwarp.run.folder import locked_run
 with locked_run(Path(sys.argv[1])):
     child = os.fork()
     if child:
