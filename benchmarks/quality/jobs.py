@@ -32,20 +32,27 @@ class Row:
 
 
 DEFAULT, PAPER = Row("default"), Row("paper", "paper")
+RAW = Row("raw", "default", {"exposures": False})  # as published tables are
 # gsplat as its examples have it, and with what our default has and they lack.
 _BACKGROUND = {"background": True}
 _EXPOSED = _BACKGROUND | {"exposures": True}
 PEERS = (
     Row("gsplat MCMC", None),
     Row("gsplat MCMC, background", None, _BACKGROUND),
+    Row("gsplat MCMC, raw", None, _BACKGROUND | {"even_start": True, "skybox": 100}),
     Row("gsplat MCMC, exposures", None, _EXPOSED),
     Row("gsplat MCMC, even start", None, _EXPOSED | {"even_start": True}),
     Row("gsplat MCMC, skybox", None, _EXPOSED | {"even_start": True, "skybox": 100}),
     Row("gsplat default", None, _BACKGROUND | {"strategy": "default"}),
     Row("gsplat 2DGS", None, _BACKGROUND | {"strategy": "default", "primitive": "2dgs"}),
 )
-ROWS = {row.name: row for row in (DEFAULT, PAPER, *PEERS)}
-TABLES = {"peers": ((DEFAULT, *PEERS), (SIZE, SIZE // 4)), "paper": ((PAPER,), (SIZE,))}
+RAW_PEERS = tuple(row for row in PEERS if not row.settings.get("exposures"))
+ROWS = {row.name: row for row in (DEFAULT, RAW, PAPER, *PEERS)}
+TABLES = {
+    "peers": ((DEFAULT, *PEERS), (SIZE, SIZE // 4)),
+    "raw": ((DEFAULT, RAW, *RAW_PEERS), (SIZE,)),
+    "paper": ((PAPER,), (SIZE,)),
+}
 
 
 @dataclass(frozen=True)
