@@ -27,17 +27,16 @@ def save_cameras(
 
     `before` are the same cameras before their poses were refined; those that differ are written, too.
     """
-    data: dict[str, object] = {}
     origins = {camera.origin or WORLD for members in cameras.values() for camera in members.values()} - {WORLD}
-    if origins:
-        data["origin"] = list(*origins)
+    data: dict[str, object] = {"origin": list(*origins)} if origins else {}
     for group, members in cameras.items():
         entries = {}
         for name, camera in members.items():
             entry: dict[str, object] = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
             entry |= {"width": camera.width, "height": camera.height, "near": camera.near}
-            if before is not None and not torch.equal(before[group][name].viewmat.cpu(), camera.viewmat.cpu()):
-                entry["given_viewmat"] = before[group][name].viewmat.tolist()
+            given = camera if before is None else before[group][name]
+            if not torch.equal(given.viewmat.cpu(), camera.viewmat.cpu()):
+                entry["given_viewmat"] = given.viewmat.tolist()
             entries[name] = entry
         data[group] = entries
     write_json(path, data)

@@ -1,4 +1,4 @@
-"""Cameras as nerfstudio's JSON: round trips, its conventions, and one line for what is wrong."""
+"""Cameras on disk, of a run and of nerfstudio: round trips, conventions, and one line for what is wrong."""
 
 import json
 import math
@@ -9,20 +9,22 @@ import pytest
 import torch
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, load_transforms, save_camera_path, save_transforms
 from nexwarp.cameras.paths import look_at
-from tests.scenes import intrinsics, rigid
+from tests.model_file_support import refused
+from tests.scenes import intrinsics, make_camera, random_scene, rigid
 
 FAR = 1e-6
 
 
-def cameras(count: int = 6, centred: bool = False, dtype: torch.dtype = torch.float32) -> list[Camera]:
+def cameras(count: int = 6, centred: bool = False) -> list[Camera]:
     out = []
     for i in range(count):
         quat = tuple(torch.randn(4, dtype=torch.float64).tolist())
         viewmat = rigid(quat, tuple((5 * torch.randn(3, dtype=torch.float64)).tolist()))
         K = intrinsics(50.0 + i, 50.0 + i, 32, 24) if centred else intrinsics(50.0 + i, 61.5, 20.25 + i, 30.0)
-        out.append(Camera(viewmat.to(dtype), K.to(dtype), 64, 48, near=0.1))
+        out.append(Camera(viewmat.float(), K.float(), 64, 48, near=0.1))
     return out
 
 
@@ -185,3 +187,53 @@ def test_other_wrong_inputs(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=message):
             save(tmp_path / "a.json", *given)
     assert not list(tmp_path.iterdir())
+
+
+# The cameras of a run
+
+
+def test_cameras_come_back_exactly(tmp_path):
+    saved = {
+        "train": {f"{i}.png": make_camera(random_scene(2, off_centre=i == 1), near=0.1 * i) for i in range(3)},
+        "test": {"folder/a b.jpg": make_camera(random_scene(2, seed=5))},
+    }
+    file = tmp_path / "cameras.json"
+    save_cameras(file, saved)
+    loaded = load_cameras(file)
+    assert {group: list(members) for group, members in loaded.items()} == {g: list(m) for g, m in saved.items()}
+    for group, members in saved.items():
+        for name, camera in members.items():
+            now = loaded[group][name]
+            assert torch.equal(now.viewmat, camera.viewmat) and torch.equal(now.K, camera.K)
+            assert (now.width, now.height, now.near) == (camera.width, camera.height, camera.near)
+            assert now.viewmat.dtype == torch.float32
+
+
+ROWS = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+K = [[9.0, 0.0, 4.0], [0.0, 9.0, 3.0], [0.0, 0.0, 1.0]]
+CAMERA: dict[str, object] = {"viewmat": ROWS, "K": K, "width": 8, "height": 6}
+NEAR = CAMERA | {"near": 0.1}
+MATRICES = (ROWS[:3], "text", [[float("nan")] * 4] * 4)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        *("", "{", "[1, 2]", '{"train": [1]}', '{"train": {"a": 3}}'),
+        json.dumps({"train": {"a": CAMERA}}),  # no near
+        *(json.dumps({"train": {"a": NEAR | {"viewmat": matrix}}}) for matrix in MATRICES),
+        *(json.dumps({"train": {"a": NEAR | {name: ROWS}}}) for name in ("near", "K", "width")),
+        json.dumps({"train": {"a": NEAR | {"width": 0}}}),
+        *(json.dumps({"train": {name: NEAR}}) for name in ("../a", "C:/a")),
+        json.dumps({"validation": {"a": NEAR}}),
+    ],
+)
+def test_malformed_cameras(tmp_path, content):
+    file = tmp_path / "cameras.json"
+    file.write_text(content)
+    refused(ValueError, load_cameras, file, names=file, match="expected named cameras as JSON")
+
+
+def test_missing_cameras(tmp_path):
+    file = tmp_path / "cameras.json"
+    refused(FileNotFoundError, load_cameras, file, names=file, match="expected the run's cameras")
