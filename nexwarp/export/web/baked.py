@@ -8,7 +8,6 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.export.bake import Baked
-from nexwarp.export.bake import bake as bake_model
 from nexwarp.export.web.scene_file import array_of, joined_file, scene_arrays, scene_header
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
@@ -17,13 +16,6 @@ BAKED_FILE, ATLAS_FILE = "baked.nxb", "atlas.webp"
 MAGIC = b"NXWBAKED"
 QUALITY = 95  # of the lossy picture: 0.1 dB against photos of the demo, at 0.3 of the size of a lossless one
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
-
-
-def bake(model: Model, cameras: Mapping[str, Camera]) -> dict[str, bytes]:
-    """Bake a model for the page; return the content of its files by name, none without cameras."""
-    if not cameras or not len(model.surfels):
-        return {}
-    return encode_baked(bake_model(model, list(cameras.values())), cameras)
 
 
 @torch.no_grad()

@@ -12,14 +12,14 @@ from pathlib import Path
 import torch
 
 from nexwarp.cameras.camera import Camera, resized
-from nexwarp.export.web.baked import bake
+from nexwarp.export.bake import bake
+from nexwarp.export.web.baked import encode_baked
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
 from nexwarp.io.files import write_together
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.model import Model
 
 INDEX = "index.html"
-TITLE = "__TITLE__"
 IMPORT_MAP = '{"imports": {"nexwarp/": "./"}}'
 STYLE_LINK = '<link rel="stylesheet" href="style.css">'
 POSTER_WIDTH = 640
@@ -47,10 +47,12 @@ def page_files(
 ) -> dict[str, bytes]:
     """Return the content of the page's files by name."""
     content = dict(static_files())
-    content[INDEX] = content[INDEX].decode().replace(TITLE, html.escape(title)).encode()
+    content[INDEX] = content[INDEX].decode().replace("__TITLE__", html.escape(title)).encode()
     poster = _poster(model, next(iter(cameras.values()))) if cameras else None
     content[SCENE_FILE] = encode_scene(model, cameras, quality=quality, title=title, poster=poster)
-    return content | bake(model, cameras)
+    if cameras and len(model.surfels):
+        content |= encode_baked(bake(model, list(cameras.values())), cameras)
+    return content
 
 
 @cache
