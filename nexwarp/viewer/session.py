@@ -144,104 +144,6 @@ class PathEditor:
             self.note.content = f"The path was not saved: {error}"
 
 
-class Panel:
-    """The controls of one client."""
-
-    def __init__(self, session: "Session") -> None:
-        self.session, self.gui = session, session.client.gui
-        self.controls: dict[str, viser.GuiInputHandle[Any]] = {}  # by the name of the setting
-        tabs = self.gui.add_tab_group(order=10.0)
-        with tabs.add_tab("Look"):
-            self._look()
-        with tabs.add_tab("Cameras"):
-            self._cameras()
-        with tabs.add_tab("Record"):
-            self._record()
-        self.gui.add_divider(order=15.0)
-        self.gui.add_markdown(HELP, order=20.0)
-
-    def _look(self) -> None:
-        gui, settings = self.gui, self.session.settings
-        mode = gui.add_dropdown("Show", tuple(MODES), initial_value=settings.mode)
-        self._connect(mode, "mode")
-        self.legend = gui.add_html("")
-        for name, label, hint in CONTROLS:
-            value = getattr(settings, name)
-            if name in RANGES:
-                low, high = RANGES[name]
-                self.controls[name] = gui.add_slider(label, low, high, 1, value, hint=hint)
-            else:
-                self.controls[name] = gui.add_checkbox(label, value, hint=hint)
-            self._connect(self.controls[name], name)
-        fov = within(round(float(np.rad2deg(self.session.home.fov))), FOV_DEGREES)
-        self.fov = gui.add_slider("Field of view", *FOV_DEGREES, 1.0, fov, hint="Vertical")
-        on_change(self.fov, self._set_fov)
-        self.status = gui.add_html("")
-        self.show(None, None)
-
-    def _set_fov(self, degrees: float) -> None:
-        self.session.client.camera.fov = float(np.deg2rad(within(degrees, FOV_DEGREES)))
-
-    def _connect(self, control: "viser.GuiInputHandle[T]", name: str) -> None:
-        """Make a control change a setting, and show the clamped value."""
-
-        def change(value: T) -> None:
-            try:
-                self.session.change(name, value)
-            except ValueError:  # a value that the panel does not offer
-                return
-            set_changed(control, "value", getattr(self.session.settings, name))
-            self.show(None, None)
-
-        on_change(control, change)
-
-    def _cameras(self) -> None:
-        from viser import Icon
-
-        gui, session = self.gui, self.session
-        home = session.home
-        on_click(gui.add_button("Back to the start", icon=Icon.HOME), lambda: session.go(home.pose, home.fov))
-        if not session.cameras:
-            gui.add_markdown("This run has no cameras.")
-            return
-        jump = gui.add_dropdown("Go to", tuple(session.cameras), hint="Go to the camera of a photo")
-        on_change(jump, session.jump)
-        on_click(gui.add_button("Go there", icon=Icon.CAMERA), lambda: session.jump(jump.value))
-        visible = gui.add_checkbox("Show cameras", True, hint="Blue: training views. Orange: test views.")
-        on_change(visible, lambda shown: set_changed(session.group, "visible", bool(shown)))
-
-    def _record(self) -> None:
-        from viser import Icon
-
-        gui, session = self.gui, self.session
-        gui.add_markdown("**Screenshot** of the current view, as PNG")
-        height = gui.add_number("Height", 1080, min=SCREENSHOT_HEIGHTS[0], max=SCREENSHOT_HEIGHTS[1], step=1)
-        shot = gui.add_button("Save screenshot", icon=Icon.PHOTO, hint="The width follows from the shape of the window")
-        on_click(shot, lambda: session.take_screenshot(int(within(height.value, SCREENSHOT_HEIGHTS))))
-        if session.viewer.save_path is not None:
-            gui.add_divider()
-            self.path = PathEditor(session, session.viewer.keep_path)
-
-    def show(self, picture: Picture | None, status: str | None) -> None:
-        """Show the legend of a picture, None before the first one, and a status line; None keeps the present one."""
-        mode = self.session.settings.mode
-        text = html.escape(MODES[mode])
-        if picture is not None and picture.span is not None:
-            low, high = picture.span
-            stops = (viridis()[::17] * 255).round().int().tolist()
-            gradient = ",".join(f"rgb({r},{g},{b})" for r, g, b in stops)
-            text += (
-                '<div style="height:0.6em;border-radius:0.2em;margin-top:0.4em;'
-                f'background:linear-gradient(to right,{gradient})"></div>'
-                f'<div style="display:flex;justify-content:space-between"><span>{low:.3g}</span>'
-                f"<span>{high:.3g}</span></div>"
-            )
-        set_changed(self.legend, "content", f'<div style="{SMALL}">{text}</div>')
-        if status is not None:
-            set_changed(self.status, "content", f'<div style="{SMALL}">{html.escape(status)}</div>')
-        set_changed(self.controls["slot"], "visible", mode in BY_SLOT)
-
-
 class TrainingPanel:
     """The controls of a training: progress and pause."""
 
@@ -297,7 +199,14 @@ class Session:
         self.drawn_scale = self.drawn_at = 0.0
         self.screenshot: int | None = None  # height of the one that is requested and not drawn yet, pixels
         self.closed = threading.Event()
-        self.panel = Panel(self)
+        self.controls: dict[str, viser.GuiInputHandle[Any]] = {}  # by the name of the setting
+        gui = client.gui
+        tabs = gui.add_tab_group(order=10.0)
+        for label, add in (("Look", self._look), ("Cameras", self._cameras), ("Record", self._record)):
+            with tabs.add_tab(label):
+                add()
+        gui.add_divider(order=15.0)
+        gui.add_markdown(HELP, order=20.0)
         self._add_frustums()
         client.camera.on_update(self._moved)
         self._take_over(client.camera)
@@ -352,7 +261,7 @@ class Session:
                 camera.wxyz = np.array(_wxyz(pose))
                 camera.look_at = position + forward * distance
                 camera.fov = fov
-            set_changed(self.panel.fov, "value", float(round(float(np.rad2deg(fov)))))
+            set_changed(self.fov, "value", float(round(float(np.rad2deg(fov)))))
 
     # Frustums
 
@@ -397,10 +306,92 @@ class Session:
             frustums[i].visible = bool(far[i])
         self.shown = far
 
-    def take_screenshot(self, height: int) -> None:
+    # The controls
+
+    def _look(self) -> None:
+        gui, settings = self.client.gui, self.settings
+        mode = gui.add_dropdown("Show", tuple(MODES), initial_value=settings.mode)
+        self._connect(mode, "mode")
+        self.legend = gui.add_html("")
+        for name, label, hint in CONTROLS:
+            value = getattr(settings, name)
+            if name in RANGES:
+                low, high = RANGES[name]
+                self.controls[name] = gui.add_slider(label, low, high, 1, value, hint=hint)
+            else:
+                self.controls[name] = gui.add_checkbox(label, value, hint=hint)
+            self._connect(self.controls[name], name)
+        fov = within(round(float(np.rad2deg(self.home.fov))), FOV_DEGREES)
+        self.fov = gui.add_slider("Field of view", *FOV_DEGREES, 1.0, fov, hint="Vertical")
+        on_change(self.fov, self._set_fov)
+        self.status = gui.add_html("")
+        self.show(None, None)
+
+    def _set_fov(self, degrees: float) -> None:
+        self.client.camera.fov = float(np.deg2rad(within(degrees, FOV_DEGREES)))
+
+    def _connect(self, control: "viser.GuiInputHandle[T]", name: str) -> None:
+        """Make a control change a setting, and show the clamped value."""
+
+        def change(value: T) -> None:
+            try:
+                self.change(name, value)
+            except ValueError:  # a value that the panel does not offer
+                return
+            set_changed(control, "value", getattr(self.settings, name))
+            self.show(None, None)
+
+        on_change(control, change)
+
+    def _cameras(self) -> None:
+        from viser import Icon
+
+        gui, home = self.client.gui, self.home
+        on_click(gui.add_button("Back to the start", icon=Icon.HOME), lambda: self.go(home.pose, home.fov))
+        if not self.cameras:
+            gui.add_markdown("This run has no cameras.")
+            return
+        jump = gui.add_dropdown("Go to", tuple(self.cameras), hint="Go to the camera of a photo")
+        on_change(jump, self.jump)
+        on_click(gui.add_button("Go there", icon=Icon.CAMERA), lambda: self.jump(jump.value))
+        visible = gui.add_checkbox("Show cameras", True, hint="Blue: training views. Orange: test views.")
+        on_change(visible, lambda shown: set_changed(self.group, "visible", bool(shown)))
+
+    def _record(self) -> None:
+        from viser import Icon
+
+        gui = self.client.gui
+        gui.add_markdown("**Screenshot** of the current view, as PNG")
+        height = gui.add_number("Height", 1080, min=SCREENSHOT_HEIGHTS[0], max=SCREENSHOT_HEIGHTS[1], step=1)
+        shot = gui.add_button("Save screenshot", icon=Icon.PHOTO, hint="The width follows from the shape of the window")
+        on_click(shot, lambda: self._take_screenshot(height.value))
+        if self.viewer.save_path is not None:
+            gui.add_divider()
+            self.path = PathEditor(self, self.viewer.keep_path)
+
+    def _take_screenshot(self, height: float) -> None:
         """Request a picture of this height in pixels, in place of one that is not drawn yet."""
-        self.screenshot = height
+        self.screenshot = int(within(height, SCREENSHOT_HEIGHTS))
         self.viewer.wake()
+
+    def show(self, picture: Picture | None, status: str | None) -> None:
+        """Show the legend of a picture, None before the first one, and a status line; None keeps the present one."""
+        mode = self.settings.mode
+        text = html.escape(MODES[mode])
+        if picture is not None and picture.span is not None:
+            low, high = picture.span
+            stops = (viridis()[::17] * 255).round().int().tolist()
+            gradient = ",".join(f"rgb({r},{g},{b})" for r, g, b in stops)
+            text += (
+                '<div style="height:0.6em;border-radius:0.2em;margin-top:0.4em;'
+                f'background:linear-gradient(to right,{gradient})"></div>'
+                f'<div style="display:flex;justify-content:space-between"><span>{low:.3g}</span>'
+                f"<span>{high:.3g}</span></div>"
+            )
+        set_changed(self.legend, "content", f'<div style="{SMALL}">{text}</div>')
+        if status is not None:
+            set_changed(self.status, "content", f'<div style="{SMALL}">{html.escape(status)}</div>')
+        set_changed(self.controls["slot"], "visible", mode in BY_SLOT)
 
 
 def _wxyz(pose: np.ndarray) -> tuple[float, float, float, float]:

@@ -1,11 +1,15 @@
 """The viewer: draws pictures for all connected browsers, on its own or between the steps of a training."""
 
 import contextlib
+import errno
+import importlib.util
 import io
 import logging
 import math
+import socket
 import threading
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -19,12 +23,13 @@ from nexwarp.io.files import one_line
 from nexwarp.model.model import Model
 from nexwarp.viewer import pacing
 from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
-from nexwarp.viewer.server import start_server
 from nexwarp.viewer.session import Session, TrainingPanel
 from nexwarp.viewer.world import Viewpoint, World, clearest
 
 if TYPE_CHECKING:
     import viser
+
+    from nexwarp.viewer.security import Gate
 
 SHARE = 0.2  # of a training's time for pictures
 THUMBNAIL_SIDE = 96  # pixels along the longer side
@@ -169,7 +174,7 @@ class Viewer:
                     continue
             except Exception as error:  # for example out of memory; the other clients continue
                 session.drawn_version, session.drawn_scale, session.drawn_step = session.version, 1.0, self.step
-                session.panel.show(None, f"This picture could not be drawn: {_reason(error)}")
+                session.show(None, f"This picture could not be drawn: {_reason(error)}")
             seconds = time.perf_counter() - start
             return min(seconds, pacing.FIRST_SECONDS) if is_first else seconds
         return None
@@ -207,7 +212,7 @@ class Viewer:
         session.client.scene.set_background_image(picture.pixels, format="jpeg", jpeg_quality=quality)
         session.drawn_version, session.drawn_scale, session.drawn_step = version, scale, self.step
         text = f"{width} x {height}, {1e3 * seconds:.0f} ms"
-        session.panel.show(picture, text if scale >= 1.0 else f"{text} (window: {here.width} x {here.height})")
+        session.show(picture, text if scale >= 1.0 else f"{text} (window: {here.width} x {here.height})")
 
     def _picture(
         self, here: Viewpoint, scale: float, settings: Settings, stale: Callable[[], bool] = lambda: False
@@ -302,3 +307,70 @@ def _kind(settings: Settings) -> tuple[bool, int]:
 def _reason(error: Exception) -> str:
     """The message of an error, or its type if it has none."""
     return one_line(error) or type(error).__name__
+
+
+# The server
+
+
+def start_server(host: str, port: int) -> tuple["viser.ViserServer", str, "Gate"]:
+    """Start viser on exactly this address; return it, the address to open, with a token if it needs one, and its gate.
+
+    The gate admits requests by the rules of security.py, none until `is_open` is set.
+
+    ValueError: viser is not installed, or the address cannot be used; the message gives the reason.
+    """
+    address = check_server(host, port)
+    import viser
+
+    from nexwarp.viewer.security import Access, Gate, accept_only_known
+
+    # Broken connections and invalid messages are errors of the page: they are not logged.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", ".* on a closed connection", UserWarning)  # a tab was closed
+    gate = Gate(Access.to(address))
+    with contextlib.redirect_stdout(io.StringIO()), gate.before_viser():  # drops its banner
+        server = viser.ViserServer(host=address, port=port, verbose=False)
+    if not gate.attached:
+        server.stop()
+        raise ValueError(f"the viewer needs viser as in constraints.txt, found {viser.__version__}")
+    if port and server.get_port() != port:  # the port was taken after the check; viser chose the next one
+        server.stop()
+        raise _in_use(host, port)
+    accept_only_known(server)
+    return server, _url(address, server.get_port(), gate.access.token), gate
+
+
+def check_server(host: str, port: int) -> str:
+    """Return the numeric address of a host, an IPv4 one if it has several; viser would resolve it again.
+
+    ValueError: viser is missing, or the address cannot be used; viser itself would try other ports.
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise ValueError("the viewer needs the package viser, found none; pip install 'nexwarp[viewer]'")
+    if not 0 <= port <= 65535:
+        raise ValueError(f"--port: expected 0 to 65535, got {port}")
+    try:
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, kind, protocol, _, address = min(addresses, key=lambda entry: entry[0] != socket.AF_INET)
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+            probe.listen()
+        return socket.getnameinfo(address, socket.NI_NUMERICHOST | socket.NI_NUMERICSERV)[0]
+    except (OSError, UnicodeError) as error:  # UnicodeError: a name that DNS cannot hold
+        number = getattr(error, "errno", None)
+        if number == errno.EADDRINUSE:
+            raise _in_use(host, port) from None
+        if number in (errno.EACCES, errno.EPERM):
+            raise ValueError(f"--port: expected a port that may be used, but {port} is refused ({error})") from None
+        raise ValueError(f"--host: expected an address of this machine, got {host!r} ({error})") from None
+
+
+def _in_use(host: str, port: int) -> ValueError:
+    return ValueError(f"--port: expected a free port, but {port} is in use on {host}; give another --port")
+
+
+def _url(address: str, port: int, token: str) -> str:
+    """Address to open; of all interfaces, the loopback one."""
+    name = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address, address)
+    return f"http://{f'[{name}]' if ':' in name else name}:{port}" + (f"/?token={token}" if token else "")

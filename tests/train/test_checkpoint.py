@@ -3,40 +3,15 @@
 import os
 import random
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
 from nexwarp.data import Scene
-from nexwarp.io.files import write_atomically
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, load_checkpoint, save_checkpoint
 from nexwarp.train.trainer import Trainer
 from tests.model_file_support import refused
 from tests.trainer_support import small
-
-
-@pytest.mark.parametrize("stage", ["write", "rename"])
-def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, stage):
-    file = tmp_path / "file"
-    file.write_bytes(b"old")
-
-    def full(path: Path, content: bytes) -> int:
-        with open(path, "wb") as half:
-            half.write(content[: len(content) // 2])
-        raise OSError("no space left on device")
-
-    def fail(*_: Any) -> None:
-        raise OSError("cannot rename")
-
-    if stage == "write":
-        monkeypatch.setattr(Path, "write_bytes", full)
-    else:
-        monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(OSError, match=r"no space|cannot rename"):
-        write_atomically(file, b"new and longer")
-    assert file.read_bytes() == b"old" and os.listdir(tmp_path) == ["file"]
-
 
 # Checkpoints
 

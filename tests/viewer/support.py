@@ -97,18 +97,24 @@ class Client:
 
 
 @contextmanager
-def serving(model: nw.Model, host: str = "127.0.0.1", **arguments: Any) -> Iterator[Viewer]:
-    """A viewer that draws on a thread of its own."""
-    pytest.importorskip("viser")
+def shown(viewer: Viewer) -> Iterator[None]:
+    """Let a viewer draw on a thread of its own."""
     over = threading.Event()
-    with Viewer(lambda: model, ring(), ViewerOptions(0.01, host=host, port=0), **arguments) as viewer:
-        thread = threading.Thread(target=viewer.show, args=(over.is_set,))
-        thread.start()
-        try:
-            yield viewer
-        finally:
-            over.set()
-            thread.join()
+    thread = threading.Thread(target=viewer.show, args=(over.is_set,))
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@contextmanager
+def serving(model: nw.Model, host: str = "127.0.0.1", **arguments: Any) -> Iterator[Viewer]:
+    """A viewer of a model that draws."""
+    pytest.importorskip("viser")
+    with Viewer(lambda: model, ring(), ViewerOptions(0.01, host=host, port=0), **arguments) as viewer, shown(viewer):
+        yield viewer
 
 
 def wait_for(condition: Callable[[], bool]) -> None:

@@ -6,9 +6,8 @@ from urllib.parse import urlsplit
 import pytest
 from websockets.datastructures import Headers
 
-from nexwarp.viewer import Viewer
+from nexwarp.viewer import Viewer, check_server
 from nexwarp.viewer.security import Access, is_loopback
-from nexwarp.viewer.server import check_server
 from tests.viewer.support import Client, serving
 
 LOCAL = Access(local=True, token="")

@@ -4,10 +4,9 @@ import gc
 import math
 import os
 import socket
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -21,7 +20,7 @@ from nexwarp.viewer import viewer as viewer_module
 from nexwarp.viewer.modes import Picture, draw
 from nexwarp.viewer.pacing import BAND_PIXELS, FIRST_PIXELS, MOST_PIXELS, MOST_SIDE, Pace, limited
 from nexwarp.viewer.session import Session
-from tests.viewer.support import WATCHED, Client, ring, serving, wait_for
+from tests.viewer.support import WATCHED, Client, ring, serving, shown, wait_for
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -103,7 +102,7 @@ def test_a_client_that_reads_slowly_gets_few_pictures_and_is_closed(model, monke
             slow.look()
             wait_for(lambda: len(viewer.sessions) == 2)
             mine, other = (viewer.sessions[number] for number in sorted(viewer.sessions))
-            other.take_screenshot(64)
+            other._take_screenshot(64)
             end = time.monotonic() + 20.0
             while heavy_pictures.count(mine.client.client_id) < 9:
                 assert time.monotonic() < end
@@ -119,27 +118,21 @@ def test_a_client_that_reads_slowly_gets_few_pictures_and_is_closed(model, monke
 def test_200_clients_are_served_or_refused_with_a_reason(model):
     from websockets.exceptions import InvalidStatus
 
-    served: list[Client] = []
     reasons: list[str] = []
     with serving(model) as viewer:
-        try:
+        with ExitStack() as stack:
+            served: list[Client] = []
             for _ in range(200):
                 try:
-                    served.append(Client(viewer))
+                    served.append(stack.enter_context(Client(viewer)))
                 except InvalidStatus as error:
-                    assert error.response.status_code == 503
-                    reasons.append(error.response.body.decode())
+                    reasons.append(f"{error.response.status_code} {error.response.body.decode()}")
             assert len(served) == security.MAX_CLIENTS and len(reasons) == 200 - len(served)
-            assert set(reasons) == {
-                "the viewer serves at most 32 browser tabs: close one of them and reload this page\n"
-            }
+            text = "the viewer serves at most 32 browser tabs: close one of them and reload this page"
+            assert set(reasons) == {f"503 {text}\n"}
             for client in served:
                 client.look()
-            for client in served:
-                assert client.picture().ndim == 3
-        finally:
-            for client in served:
-                client.socket.close()
+            assert all(client.picture().ndim == 3 for client in served)
         wait_for(lambda: not viewer.gate.clients)
         with Client(viewer) as late:
             late.look()
@@ -201,16 +194,10 @@ def test_no_error_of_the_viewer_ends_a_training(model, monkeypatch, error, where
             if where == "draw":
                 assert any("could not be drawn" in str(message) for message in client.hear())
             monkeypatch.setattr(viewer_module, "draw", draw)
-            over = threading.Event()
             if where != "welcome":
                 session_of(viewer).change("mode", "alpha")
-                thread = threading.Thread(target=viewer.show, args=(over.is_set,))
-                thread.start()
-                try:
+                with shown(viewer):
                     assert client.picture().ndim == 3, "it recovers"
-                finally:
-                    over.set()
-                    thread.join()
 
 
 def clients() -> dict[int, object]:

@@ -105,7 +105,7 @@ def test_a_path_is_played_and_kept_as_its_views_say(model, tmp_path, monkeypatch
         client.look()
         wait_for(lambda: bool(viewer.sessions))
         (session,) = viewer.sessions.values()
-        editor = session.panel.path
+        editor = session.path
         editor.keep()
         assert "not saved" in editor.note.content
         for name in [*session.cameras, "train/0.png"]:

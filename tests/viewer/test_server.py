@@ -54,7 +54,7 @@ def test_nonsense_is_dropped_and_hurts_nobody(model, capfd):
         bad.look()
         wait_for(lambda: len(viewer.sessions) == 2)
         session = viewer.sessions[max(viewer.sessions)]
-        slider = session.panel.controls["max_hits"]
+        slider = session.controls["max_hits"]
         uuid = slider._impl.uuid
         wait_for(lambda: session.drawn_version == session.version)
         version = session.version
