@@ -72,13 +72,7 @@ class Surfels(nn.Module):
 
     @classmethod
     def from_activated(
-        cls,
-        means: Array,
-        quats: Array,
-        scales: Array,
-        opacities: Array,
-        gammas: Array,
-        sh: Array,
+        cls, means: Array, quats: Array, scales: Array, opacities: Array, gammas: Array, sh: Array
     ) -> "Surfels":
         """Make surfels with new leaf parameters from activated values; `rasterize` keeps the graph of tensors.
 

@@ -64,10 +64,7 @@ class ExportOrder:
 
 
 def export_run(
-    opened: OpenedModel,
-    order: ExportOrder,
-    device: torch.device | str = "cpu",
-    observe: Progress = lambda *_: None,
+    opened: OpenedModel, order: ExportOrder, device: torch.device | str = "cpu", observe: Progress = lambda *_: None
 ) -> Sequence[Path]:
     """Export a run or a model, and return the files that were written; docs/outputs.md describes them.
 

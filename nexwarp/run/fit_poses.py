@@ -23,11 +23,7 @@ Aim = tuple[Camera, torch.Tensor, torch.Tensor]  # camera; photo (H, W, 3); what
 
 
 def fit_poses(
-    model: Model,
-    views: Sequence[View],
-    *,
-    steps: int = STEPS,
-    progress: Callable[[str], None] | None = None,
+    model: Model, views: Sequence[View], *, steps: int = STEPS, progress: Callable[[str], None] | None = None
 ) -> tuple[list[View], dict[str, float]]:
     """Return views with the poses at which the model's renderings fit their photos best, and entries for metrics.json.
 

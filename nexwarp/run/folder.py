@@ -26,15 +26,7 @@ from nexwarp.cameras.nerfstudio import save_camera_path
 from nexwarp.cameras.paths import PATHS, surrounding
 from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError, check_version
-from nexwarp.io.files import (
-    is_abandoned,
-    is_temporary,
-    make_folders,
-    one_line,
-    remove_empty,
-    sync,
-    written_aside,
-)
+from nexwarp.io.files import is_abandoned, is_temporary, make_folders, one_line, remove_empty, sync, written_aside
 from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load

@@ -87,10 +87,7 @@ class RenderOrder:
                 self.path is not None and self.path not in PATHS and not self.path.lower().endswith(".json"),
                 f"--path: expected {', '.join(PATHS)} or a file ending in .json, got {self.path!r}",
             ),
-            (
-                self.frames is not None and self.frames < 0,
-                f"--frames: expected at least 0, got {self.frames}",
-            ),
+            (self.frames is not None and self.frames < 0, f"--frames: expected at least 0, got {self.frames}"),
             (
                 self.frames == 0 and (self.video is not None or self.views is None),
                 "--frames: expected at least 1 for a path or a video, got 0",

@@ -8,14 +8,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from tests.scenes import (
-    SURFEL_KEYS,
-    make_camera,
-    make_surfels,
-    make_texture,
-    random_scene,
-    rigid,
-)
+from tests.scenes import SURFEL_KEYS, make_camera, make_surfels, make_texture, random_scene, rigid
 from tests.tolerances import ACTIVATION
 
 

@@ -154,10 +154,7 @@ def test_bounds_themselves_render_finite(stored: Path, tmp_path: Path, name: str
         ({"surfels.raw_quats": torch.zeros(12, 4)}, "surfels.raw_quats: expected a length of at least 1e-12, got 0"),
         ({"exposures.falloff": torch.tensor([60.0, -30.0, 0.4])}, "expected a t + b t^2 of at most 20, got a 60 and b"),
         ({"exposures.falloff": torch.tensor([90.0, -95.0, 0.4])}, "expected a t + b t^2 of at most 20, got a 90 and b"),
-        (
-            {"exposures.falloff": torch.tensor([0.1, 0.1, 1e-20])},
-            "squared tangent of at least 1e-12, got 1e-20",
-        ),
+        ({"exposures.falloff": torch.tensor([0.1, 0.1, 1e-20])}, "squared tangent of at least 1e-12, got 1e-20"),
         (dict.fromkeys(("texture.grid", *MATRICES), 1e4), "texture.mlp.2.weight: expected outputs of at most 1e+12"),
     ],
 )
