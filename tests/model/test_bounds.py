@@ -3,7 +3,6 @@
 import functools
 import json
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.model.bounds import BOUNDS
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model_file import load, save_model
@@ -189,32 +187,3 @@ def test_a_number_of_the_metadata_is_refused_or_renders_finite(
         return
     assert math.isfinite(value) and abs(value) < 1e30
     check_pictures(model, tiny_camera(), f"{key} = {value}")
-
-
-def camera_numbers(entry: dict[str, Any]) -> Iterator[tuple[str, list[Any] | dict[str, Any], Any]]:
-    """Names of a camera's numbers, with the container and the key of each."""
-    for row in range(3):
-        yield f"viewmat[{row}][3]", entry["viewmat"][row], 3
-        yield f"viewmat[{row}][0]", entry["viewmat"][row], 0
-    for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)):
-        yield f"K[{row}][{column}]", entry["K"][row], column
-    yield "near", entry, "near"
-
-
-@pytest.mark.parametrize("value", VALUES)
-def test_a_number_of_a_camera_is_refused_or_renders_finite(stored: Path, tmp_path: Path, value: float) -> None:
-    model, file = load(stored), tmp_path / "cameras.json"
-    save_cameras(file, {"train": {"a": tiny_camera()}, "test": {}})
-    data = json.loads(file.read_text())
-    for name, container, key in camera_numbers(data["train"]["a"]):
-        before = container[key]
-        container[key] = value
-        file.write_text(json.dumps(data))
-        container[key] = before
-        try:
-            camera = load_cameras(file)["train"]["a"]
-        except ValueError as error:
-            check_message(error, file, name.split("[")[0])
-            continue
-        assert math.isfinite(value) and not (name.endswith("[3]") and abs(value) >= 1e30), name
-        check_pictures(model, camera, f"{name} = {value}")

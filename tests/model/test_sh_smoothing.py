@@ -111,25 +111,6 @@ def test_coefficients_are_those_of_ridge_regression(device: torch.device, streng
     assert (found - expected).abs().max() < 1e-4 < (found - before[0].double().cpu()).abs().max()
 
 
-def test_training_views_stay_and_what_lies_between_comes_from_them(device: torch.device) -> None:
-    """Coefficients of which views tell nothing go: what is left is the same whatever these were."""
-    surfels, views = blob(device), around([-0.5, 0.0, 0.5])
-    learnt = (surfels.sh0.detach().clone(), surfels.shN.detach().clone())
-    smooth = smooth_sh(nw.Model(surfels, None), views, 0.01)
-    assert (colors(surfels, views, smooth) - colors(surfels, views, learnt))[:, 0].abs().max() < 0.02
-    far = around([math.pi])
-    assert (colors(surfels, far, smooth) - colors(surfels, far, learnt))[:, 0].abs().max() > 0.05
-    # Add what no view sees, to coefficients of the null space of what they do see.
-    basis = torch.stack([colors(surfels, views, one(k, surfels))[:, 0, 0] for k in range(16)], dim=1).double()
-    hidden = torch.linalg.svd(basis)[2][3:].sum(0).to(surfels.sh0)
-    with torch.no_grad():
-        surfels.sh0.add_(hidden[None, :1, None])
-        surfels.shN.add_(hidden[None, 1:, None])
-    again = smooth_sh(nw.Model(surfels, None), views, 0.01)
-    for a, b in zip(smooth, again, strict=True):
-        assert (a - b)[0].abs().max() < 1e-3 < hidden.abs().max()
-
-
 def test_what_is_even_stays_and_the_strongest_smoothing_leaves_one_colour(device: torch.device) -> None:
     surfels, views = blob(device), around([-0.5, 0.0, 0.5])
     sh0, shN = smooth_sh(nw.Model(surfels, None), views, MAX_STRENGTH)

@@ -11,11 +11,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from filelock import FileLock
 
 from nexwarp.cli import main as cli
 from nexwarp.errors import RunError, StorageError
-from nexwarp.run import folder
 from nexwarp.run.folder import locked_run
 from tests.subprocesses import python_path
 
@@ -92,14 +90,6 @@ def test_the_lock_is_free_after_an_error(tmp_path):
         with pytest.raises(ZeroDivisionError), locked_run(tmp_path):
             raise ZeroDivisionError
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_descriptor_of_a_lock_is_closed_at_its_end(tmp_path, monkeypatch):
-    lock = FileLock(tmp_path / folder.LOCK_FILE, timeout=0)
-    monkeypatch.setattr(folder, "FileLock", lambda *_, **__: lock)
-    with locked_run(tmp_path):
-        assert lock.is_locked
-    assert not lock.is_locked
 
 
 @pytest.fixture
