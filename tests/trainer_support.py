@@ -64,18 +64,13 @@ def rescaled(scene: Scene, factor: float) -> Scene:
     )
 
 
-def assert_resumed_alike(scene: Scene, config: Config, straight: Trainer, folder: Path) -> Trainer:
-    """Stop after 7 steps and go on from the checkpoint: the state is that of an uninterrupted run on the CPU.
-
-    Returns:
-        The trainer that was stopped.
-    """
-    first, second = Trainer(scene, config, "cpu"), Trainer(scene, config, "cpu")
-    for _ in range(7):
-        first.step()
+def assert_resumed_alike(straight: Trainer, folder: Path, stop: int = 7, **options: Any) -> None:
+    """Stopped after some steps, restored elsewhere and gone on: the state of an uninterrupted run, bit for bit."""
+    first, second = (Trainer(straight.scene, straight.config, "cpu", **options) for _ in range(2))
+    first.run(until=stop)
     first.save(folder)
+    torch.manual_seed(99)
     second.restore(folder)
     assert_same_state(second, first)
     second.run()
     assert_same_state(second, straight)
-    return first

@@ -1,6 +1,8 @@
 """Density control: how a surfel is split, which ones are, what is pruned, and what becomes of Adam's moments."""
 
+import dataclasses
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -8,11 +10,21 @@ import torch
 from torch import nn
 
 import nexwarp as nw
+from nexwarp.cameras.camera import Camera, reduced
+from nexwarp.data import Scene
+from nexwarp.model.render import render
 from nexwarp.model.surfels import PARAMETERS
-from nexwarp.train.densify import DensityControl, split_surfels
+from nexwarp.train import densify
+from nexwarp.train.densify import DensityControl, least_contributing, split_surfels
+from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import Config, DensifyConfig
+from nexwarp.train.trainer import Trainer
+from tests.ranks_support import run_ranks
 from tests.reference.collect import rotations
 from tests.scenes import make_surfels, random_scene
+from tests.trainer_support import OFTEN, small
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 COPIED = ("raw_quats", "logit_opacities", "raw_gammas", "sh0", "shN")
 MOMENTS = ("exp_avg", "exp_avg_sq")
@@ -110,8 +122,9 @@ def test_children_tile_their_parent():
 
 
 def test_split_copies_everything_else_and_leaves_others_alone():
+    """Children start without moments, others keep theirs."""
     surfels, optimizer = make(20, seed=1)
-    old = rows_of(surfels)
+    old, before = rows_of(surfels), moments_of(surfels, optimizer)
     chosen = torch.tensor([0, 6, 13])
     others = [i for i in range(20) if i not in chosen.tolist()]
     split(surfels, optimizer, chosen)
@@ -120,17 +133,9 @@ def test_split_copies_everything_else_and_leaves_others_alone():
     for name in COPIED:
         assert torch.equal(getattr(surfels, name)[chosen], old[name][chosen]), name
         assert torch.equal(getattr(surfels, name)[20:], old[name][chosen]), name
-
-
-def test_children_start_without_moments_and_others_keep_theirs():
-    surfels, optimizer = make(20)
-    old = moments_of(surfels, optimizer)
-    chosen = torch.tensor([2, 3, 17])
-    others = [i for i in range(20) if i not in chosen.tolist()]
-    split(surfels, optimizer, chosen)
     for key, moments in moments_of(surfels, optimizer).items():
         assert len(moments) == 23, key
-        assert torch.equal(moments[others], old[key][others]) and bool((old[key][others] != 0).all()), key
+        assert torch.equal(moments[others], before[key][others]) and bool((before[key][others] != 0).all()), key
         assert not moments[chosen].any() and not moments[20:].any(), key
 
 
@@ -172,22 +177,6 @@ def test_choice_is_without_replacement_and_proportional_to_error():
     deviation = (counts - draws * expected)[live] / (draws * expected * (1 - expected))[live].sqrt()
     assert deviation.abs().max() < 4.0, f"{deviation.tolist()} standard deviations off"
     assert deviation.square().sum() < 20.0  # of 6 degrees of freedom: one in 400
-
-
-def test_choice_is_deterministic_given_the_generator():
-    def run(seed: int) -> dict[str, torch.Tensor]:
-        surfels, optimizer = make(60)
-        densifier = densifier_of(surfels, fraction=0.2)
-        densifier.accumulate(torch.linspace(0, 1, 60))
-        densifier.step(optimizer, generator(seed))
-        return rows_of(surfels)
-
-    torch.manual_seed(1)
-    first = run(5)
-    torch.manual_seed(2)  # the global state has no say
-    second, other = run(5), run(6)
-    assert all(torch.equal(first[name], second[name]) for name in PARAMETERS)
-    assert not torch.equal(first["means"], other["means"])
 
 
 # Budget, prune, sums
@@ -272,14 +261,16 @@ def test_at_the_budget_children_take_the_rows_of_pruned_surfels():
         assert torch.equal(now[others], moments[key][others]) and not now[[*parents, *gone]].any(), key
 
 
-def test_places_are_filled_before_rows_are_appended():
+@pytest.mark.parametrize(("at_cap", "count", "more", "left"), [(True, 2, 3, 21), (False, 3, 1, 18)])
+def test_a_round_that_splits_prunes_in_either_mode(at_cap, count, more, left):
+    """At the budget, places are filled before rows are appended."""
     surfels, optimizer = make(20, opacity=0.5)
     with torch.no_grad():
-        surfels.logit_opacities[[3, 8]] = -8.0
-    densifier = densifier_of(surfels, budget=21, fraction=0.2)
-    densifier.accumulate(torch.ones(20))
-    assert counts(densifier.step(optimizer, generator()), 20) == (3, 2)
-    assert len(surfels) == 21 and bool((surfels.opacities > 0.4).all()) and densifier.errors.shape == (21,)
+        surfels.logit_opacities[:count] = -8.0
+    densifier = densifier_of(surfels, budget=21, prune_at_cap=at_cap, fraction=0.2 if at_cap else 0.05)
+    densifier.accumulate(torch.ones(20) if at_cap else torch.eye(20)[10])
+    assert counts(densifier.step(optimizer, generator()), 20) == (more, count)
+    assert len(surfels) == left and bool((surfels.opacities > 0.4).all()) and densifier.errors.shape == (left,)
 
 
 @pytest.mark.parametrize(("fraction", "candidates", "more"), [(0.0, 16, 0), (0.05, 16, 1), (0.5, 1, 1), (0.5, 16, 4)])
@@ -302,15 +293,6 @@ def test_pruned_surfels_go_where_too_few_are_split(fraction, candidates, more):
     assert densifier.errors.shape == (16 + more,) and all(len(p) == 16 + more for p in optimizer.state)
     unmoved = [bool((surfels.means == mean).all(dim=1).any()) for mean in means[stay]]
     assert unmoved.count(False) == more and not any(bool((surfels.means == x).all(dim=1).any()) for x in means[gone])
-
-
-def test_a_round_that_splits_prunes_in_either_mode():
-    surfels, optimizer = make(20, opacity=0.5)
-    with torch.no_grad():
-        surfels.logit_opacities[:3] = -8.0
-    densifier = densifier_of(surfels, budget=21, prune_at_cap=False)
-    densifier.accumulate(torch.eye(20)[10])
-    assert counts(densifier.step(optimizer, generator()), 20) == (1, 3) and len(surfels) == 18
 
 
 def test_chosen_ones_are_removed_but_never_the_most_opaque():
@@ -363,3 +345,83 @@ def test_rounds_come_when_the_paper_says():
     densifier = densifier_of(surfels)
     assert [i for i in range(30_001) if densifier.due(i)] == list(range(600, 25_000, 100))
     assert densifier.active(24_999) and not densifier.active(25_000)
+
+
+# Relocation: the surfels that the training views need least make room for others
+
+
+def test_what_no_image_shows_goes_first(tiny_scene: Scene) -> None:
+    """Surfels outside of all images and behind opaque ones; what is removed is nowhere more than what stays is."""
+    trainer = Trainer(tiny_scene, small(iterations=30), "cpu")
+    surfels = trainer.surfels
+    hidden = torch.arange(0, len(surfels), 7)
+    with torch.no_grad():
+        surfels.means[hidden[::2]] += 1e4
+        surfels.logit_opacities[hidden[1::2]] = -20.0
+    cameras = [view.camera for view in tiny_scene.train]
+    share = len(hidden) / len(surfels) + 1e-6
+    chosen = least_contributing(trainer.model(), cameras, share)
+    assert torch.equal(chosen.nonzero()[:, 0], hidden)
+    chosen = least_contributing(trainer.model(), cameras, 0.5)
+    assert chosen.sum() == len(surfels) // 2 and chosen[hidden].all()
+    most = torch.zeros(len(surfels))
+    for camera in cameras:  # at full size, a sum of weights is that of half the size but for aliasing
+        out = render(surfels, None, camera)
+        most = torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1 / out.alpha.numel())))
+    assert most[chosen].mean() < 0.2 * most[~chosen].mean()
+    assert not least_contributing(trainer.model(), cameras, 0.0).any()
+
+
+def test_ranks_share_the_views(tiny_scene: Scene, tmp_path: Path) -> None:
+    """Each renders some of them, and all choose what one process would."""
+    model = Trainer(tiny_scene, small(iterations=30), "cpu").model()
+    cameras = [view.camera for view in tiny_scene.train]
+    rendered: list[int] = []
+
+    def noted(camera: Camera, height: int) -> Camera:
+        rendered.append(height)
+        return reduced(camera, height)
+
+    def work(ranks: Ranks) -> object:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(densify, "reduced", noted)
+            mine = cameras[ranks.rank :: ranks.size]
+            return least_contributing(model, mine, 0.3, ranks.largest).tolist(), len(rendered)
+
+    found = run_ranks(3, work, tmp_path)
+    expected = least_contributing(model, cameras, 0.3)
+    counts = [len(cameras[rank::3]) for rank in range(3)]
+    assert found == [[expected.tolist(), count] for count in counts] and 0 < expected.sum() < len(expected)
+
+
+def test_rounds_at_the_budget_relocate_in_the_first_part_of_density_control() -> None:
+    surfels = make_surfels(random_scene(100))
+    schedule = DensifyConfig(start=1, stop=1000, every=5, relocate=0.1)
+    config = Config(max_surfels=100, densify=schedule)
+    densifier = DensityControl(surfels, config)
+    due = [i for i in range(1, 1001) if densifier.due(i) and densifier.relocates(i)]
+    assert due == list(range(50, 600, 50))
+    assert DensityControl(surfels, dataclasses.replace(config, max_surfels=102)).relocates(50)
+    assert not DensityControl(surfels, dataclasses.replace(config, max_surfels=103)).relocates(50)
+    never = dataclasses.replace(config, densify=dataclasses.replace(schedule, relocate=0.0))
+    assert not DensityControl(surfels, never).relocates(50)
+    with pytest.raises(ValueError, match=r"relocate: expected at least 0 and at most 0\.5, got 0\.6"):
+        DensifyConfig(relocate=0.6)
+
+
+def test_others_take_their_place(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    removed = []
+
+    def first(model, cameras, share, _):
+        removed.append((trainer.iteration, len(model.surfels), len(cameras), share))
+        return torch.arange(len(model.surfels)) < share * len(model.surfels)
+
+    monkeypatch.setattr(densify, "least_contributing", first)
+    config = small(iterations=120, densify=dataclasses.replace(OFTEN, relocate=0.2, prune_opacity=0.0, fraction=0.2))
+    budget = 50
+    trainer = Trainer(tiny_scene, dataclasses.replace(config, max_surfels=budget), "cpu")
+    counts: dict[int, int] = {}
+    trainer.run(observe=lambda progress: counts.update({progress.iteration: progress.surfels}))
+    assert [iteration for iteration, *_ in removed] == [30]
+    assert all(before[1:] == (budget, len(tiny_scene.train), 0.2) for before in removed)
+    assert counts[30] == counts[33] == budget, "as many are split as were removed"

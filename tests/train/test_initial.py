@@ -60,26 +60,12 @@ def test_the_table_is_as_large_as_the_photos_can_fill(scene, pixels, power):
     assert texture_shape(sized, small())["table_size"] == TEXTURE.table_size
 
 
-def directions(count: int) -> torch.Tensor:
-    return torch.nn.functional.normalize(torch.randn(count, 3), dim=-1)
-
-
-def turn_cases() -> dict[str, tuple[torch.Tensor, torch.Tensor]]:
-    torch.manual_seed(0)
-    quats = torch.randn(200, 4)
-    axes = rotations(quats)[:, :, 2]
-    across = torch.linalg.cross(axes, directions(200))
-    return {
-        "random": (directions(200), quats),
-        "aligned": (axes, quats),
-        "opposite": (-axes, 5 * quats),
-        "square": (torch.nn.functional.normalize(across, dim=-1), quats),
-    }
-
-
 @pytest.mark.parametrize("case", ["random", "aligned", "opposite", "square"])
 def test_surfels_turn_to_their_normals_by_the_least_angle(case):
-    normals, quats = turn_cases()[case]
+    quats, random = torch.randn(200, 4), torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
+    axes = rotations(quats)[:, :, 2]
+    square = torch.nn.functional.normalize(torch.linalg.cross(axes, random), dim=-1)
+    normals = {"random": random, "aligned": axes, "opposite": -axes, "square": square}[case]
     turned = quats_towards(normals, quats)
     torch.testing.assert_close(turned.norm(dim=-1), torch.ones(len(turned)), rtol=0, atol=1e-5)
     z = rotations(turned)[:, :, 2]

@@ -158,8 +158,8 @@ def test_each_epoch_sees_each_view_once(scene: Scene) -> None:
     order = [taken[number] for number in sorted(taken)]
     assert sorted(taken) == list(range(3 * views))
     assert all(len(set(each)) == 1 for each in order)  # all sizes agree
-    for epoch in range(3):
-        assert sorted(each[0] for each in order[epoch * views : (epoch + 1) * views]) == list(range(views))
+    epochs = [[each[0] for each in order[start : start + views]] for start in range(0, 3 * views, views)]
+    assert all(sorted(epoch) == list(range(views)) for epoch in epochs) and epochs[0] != epochs[1] != epochs[2]
     assert len({derived_seed(0, n, k) for n in range(1000) for k in range(2)}) == 2000
 
 

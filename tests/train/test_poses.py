@@ -104,10 +104,9 @@ def test_short_runs_take_longer_steps():
 
 
 def test_resuming_a_refinement_changes_nothing(tiny_scene, tmp_path):
-    config = small(refine_poses=True)
-    straight = trained(tiny_scene, config)
+    straight = trained(tiny_scene, small(refine_poses=True))
     assert straight.poses is not None and straight.poses.corrections.abs().max() > 1e-4
-    assert_resumed_alike(tiny_scene, config, straight, tmp_path)
+    assert_resumed_alike(straight, tmp_path)
 
 
 @pytest.fixture(scope="module")

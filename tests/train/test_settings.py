@@ -104,44 +104,16 @@ def test_paper_is_the_paper():
     """The numbers of recipe.md 3.9, spelt out."""
     p = preset("paper")
     assert (p.preset, p.iterations, p.max_hits, p.sh_degree, p.sh_every) == ("paper", 30_000, 2, 3, 1000)
-    assert p.more_hits_from == 0
-    assert (p.max_surfels, p.background) == (400_000, (0.0, 0.0, 0.0))
-    assert (p.filter_points, p.orient_points) == (False, False)
+    assert (p.max_surfels, p.background, p.more_hits_from, p.mask_mode) == (400_000, (0.0, 0.0, 0.0), 0, "ignore")
+    assert not any((p.filter_points, p.orient_points, p.footprints, p.smooth_sh, p.exposures))
     assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0)
-    assert (p.mask_mode, p.footprints, p.smooth_sh) == ("ignore", False, 0.0)
-    assert not p.exposures
-    assert p.rates == LearningRates(
-        means=(1.6e-4, 1.6e-6),
-        quats=1e-3,
-        scales=5e-3,
-        opacities=0.025,
-        gammas=1e-3,
-        sh0=2.5e-3,
-        shN=1.25e-4,
-        grid=(1e-3, 1e-5),
-        mlp=(1e-3, 1e-3),
-    )
-    assert p.texture == TextureConfig(
-        levels=16,
-        table_size=2**20,
-        features=2,
-        min_resolution=16.0,
-        max_resolution=256.0,
-        width=64,
-        hidden_layers=2,
-        sh_degree=None,
-        residual=False,
-        down_weighting=True,
-    )
-    assert p.densify == DensifyConfig(
-        start=500,
-        stop=25_000,
-        every=100,
-        fraction=0.05,
-        prune_opacity=0.005,
-        prune_at_cap=False,
-        relocate=0.0,
-    )
+    constant = {"quats": 1e-3, "scales": 5e-3, "opacities": 0.025, "gammas": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
+    assert p.rates == LearningRates(means=(1.6e-4, 1.6e-6), grid=(1e-3, 1e-5), mlp=(1e-3, 1e-3), **constant)
+    sizes = {"levels": 16, "table_size": 2**20, "features": 2, "width": 64, "hidden_layers": 2, "sh_degree": None}
+    ends = {"min_resolution": 16.0, "max_resolution": 256.0}
+    assert dataclasses.asdict(p.texture) == sizes | ends | {"residual": False, "down_weighting": True}
+    pruning = {"prune_opacity": 0.005, "prune_at_cap": False, "relocate": 0.0}
+    assert p.densify == DensifyConfig(start=500, stop=25_000, every=100, fraction=0.05, **pruning)
 
 
 def test_unknown_preset_is_refused():
@@ -166,18 +138,12 @@ def test_runs_from_before_a_setting_keep_what_they_did():
     assert config_from_dict(written) == Config()
     del written["densify"]["relocate"]
     assert config_from_dict(written).densify == dataclasses.replace(DensifyConfig(), relocate=0.0)
-    del written["skybox"]
-    assert config_from_dict(written).skybox == 0
+    del written["skybox"], written["teachers"]
+    found = config_from_dict(written)
+    assert (found.skybox, found.teachers, Config().teachers) == (0, 0, None)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda d: d | {"texture": 3},
-        lambda d: d | {"iterations": "many"},
-        lambda _: [],
-    ],
-)
+@pytest.mark.parametrize("change", [lambda d: d | {"texture": 3}, lambda d: d | {"iterations": "many"}, lambda _: []])
 def test_settings_of_another_kind_are_refused(change):
     with pytest.raises(ValueError, match=r"^config: expected the settings of a nexwarp run") as caught:
         config_from_dict(change(Config().as_dict()))
@@ -205,16 +171,12 @@ def test_resume_agrees_or_is_refused(run, scene, capsys):
     before = (run / "config.json").read_bytes()
     expected = "--set: texture.levels: expected 4 as in the run to resume, got 8"
     refused(capsys, [*resume, "--set", "texture.levels=8"], expected)
-    refused(capsys, [*resume, "--set", "texture.nope=8"], "--set: texture.nope: expected a setting")
-    refused(capsys, [*resume, "--set", "preset=paper"], "--set: preset: expected --preset instead")
     assert (run / "config.json").read_bytes() == before
 
 
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--set", "nope=1"], ["--set: nope: expected a setting"]),
-        (["--set", "skybox"], ["--set: expected KEY=VALUE, got 'skybox'"]),
         (["--set", "texture.levels=many"], ['--set: texture.levels: expected an integer, got "many"']),
         (["--set", "preset=paper"], ["--set: preset: expected --preset instead"]),
         (["--seed", "1", "--set", "seed=1"], ["--set: seed: expected --seed instead"]),

@@ -23,7 +23,6 @@ from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import TextureConfig
 from nexwarp.train.report import StepReport
-from nexwarp.train.settings import config_from_dict
 from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, stage_runner
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -66,13 +65,6 @@ def settings_of(config: Config, own: OwnTeachers) -> list[Config]:
 def test_a_run_has_teachers_where_photos_are_few(changes: dict[str, Any], photos: int, count: int) -> None:
     config = dataclasses.replace(Config(), **changes)
     assert plan_teachers(config, photos).count == count
-
-
-def test_settings_of_a_run_from_before_there_were_teachers_have_none() -> None:
-    data = Config().as_dict()
-    assert config_from_dict(data).teachers is None
-    del data["teachers"]
-    assert config_from_dict(data).teachers == 0
 
 
 @pytest.mark.parametrize("iterations", [7, 30, 12_345, 30_000])

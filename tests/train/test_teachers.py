@@ -16,6 +16,7 @@ from nexwarp.model.exposures import Exposures
 from nexwarp.train.checkpoint import CHECKPOINTS
 from nexwarp.train.recipe import TextureConfig
 from tests.ranks_support import alone_as
+from tests.trainer_support import assert_resumed_alike
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -33,15 +34,6 @@ CONFIG = Config(
 @pytest.fixture(scope="module")
 def teachers(tiny_scene: Scene) -> list[Model]:
     return [nw.train(tiny_scene, dataclasses.replace(CONFIG, seed=seed), device=CPU) for seed in (1, 2)]
-
-
-def learned(trainer: Trainer) -> dict[str, torch.Tensor]:
-    """Return all learned tensors."""
-    return trainer.surfels.state_dict() | {f"texture.{k}": x for k, x in trainer.texture.state_dict().items()}
-
-
-def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
-    return all(torch.equal(x, other[name]) for name, x in one.items())
 
 
 def test_every_other_step_has_a_teachers_picture(tiny_scene: Scene, teachers: list[Model]) -> None:
@@ -128,18 +120,11 @@ def test_what_belongs_to_a_photo_does_not_count(tiny_scene: Scene, teachers: lis
 def test_a_resumed_student_has_the_bits_of_an_uninterrupted_one(
     tiny_scene: Scene, teachers: list[Model], tmp_path: Path
 ) -> None:
-    whole = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
-    whole.run()
-    begun = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
-    begun.run(until=7)
-    begun.save_checkpoint(tmp_path)
-    resumed = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
-    resumed.restore(tmp_path)
-    resumed.run()
-    assert same(learned(whole), learned(resumed))
-    alone = Trainer(tiny_scene, CONFIG, CPU)
-    alone.run()
-    assert not torch.equal(learned(whole)["sh0"], learned(alone)["sh0"])
+    whole, alone = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers), Trainer(tiny_scene, CONFIG, CPU)
+    for trainer in (whole, alone):
+        trainer.run()
+    assert_resumed_alike(whole, tmp_path, teachers=teachers)
+    assert not torch.equal(whole.surfels.sh0, alone.surfels.sh0)
 
 
 @pytest.mark.parametrize("kind", ["none", "fewer", "swapped", "bare"])

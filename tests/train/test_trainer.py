@@ -1,12 +1,10 @@
-"""Training: the laws of the loop and its schedules, and what it learns from real photos."""
+"""Training: the laws of the loop and its schedules, and that it learns."""
 
 import dataclasses
 import gc
 import itertools
 import math
 import weakref
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -14,16 +12,14 @@ import torch
 import nexwarp as nw
 from nexwarp.data import Scene, View
 from nexwarp.run.evaluate import evaluate
-from nexwarp.train.recipe import Config, DensifyConfig, LearningRates, TextureConfig
+from nexwarp.train.recipe import DensifyConfig, LearningRates
 from nexwarp.train.trainer import Trainer
 from tests.narrowing import neural
 from tests.scene_writers import with_exposures
 from tests.tolerances import assert_close
-from tests.trainer_support import OFTEN, TEXTURE, assert_same_state, rescaled, small, trained
+from tests.trainer_support import OFTEN, TEXTURE, assert_resumed_alike, assert_same_state, rescaled, small, trained
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
-FOX = Path(__file__).parents[3] / "shared" / "data" / "fox"
 
 
 @pytest.fixture(scope="session")
@@ -53,20 +49,9 @@ def test_a_trainer_is_freed_with_its_last_reference(scene):
 
 @pytest.mark.parametrize(("stop", "max_hits"), [(6, 2), (7, 2), (7, 0)])
 def test_resuming_changes_nothing(scene, tmp_path, stop, max_hits):
-    """Straight to 12 = up to `stop`, saved, restored elsewhere, and on to 12: bit for bit."""
-    config = small(max_hits=max_hits)
-    straight = trained(scene, config)
+    straight = trained(scene, small(max_hits=max_hits))
     assert len(straight.surfels) > 60  # it has split
-    first = Trainer(scene, config, "cpu")
-    for _ in range(stop):
-        first.step()
-    first.save(tmp_path)
-    second = Trainer(scene, config, "cpu")
-    torch.manual_seed(99)
-    second.restore(tmp_path)
-    assert_same_state(second, first)
-    second.run()
-    assert_same_state(second, straight)
+    assert_resumed_alike(straight, tmp_path, stop)
 
 
 def test_same_seed_same_run_and_other_seeds_differ(scene):
@@ -130,22 +115,6 @@ def test_progress_tells_what_happened(scene):
     assert max(counts) <= 120
 
 
-@pytest.mark.skipif(not FOX.is_dir(), reason=f"{FOX} is not there")
-@pytest.mark.slow
-@pytest.mark.timeout(400)
-def test_it_learns_from_real_photos():
-    """Fox at downscale 8: 5 dB more on views it has not seen than after the first iteration."""
-    scene = nw.load_scene(FOX, downscale=8)
-    config = Config(iterations=200, max_surfels=3000, texture=TextureConfig(levels=8, table_size=2**14))
-    trainer = Trainer(scene, config, "cpu")
-    trainer.step()
-    before = mean_psnr(trainer, scene.test)
-    trainer.run()
-    after = mean_psnr(trainer, scene.test)
-    assert len(trainer.surfels) <= 3000
-    assert after >= before + 5.0, f"{before:.2f} -> {after:.2f} dB"
-
-
 # Schedules
 
 
@@ -205,19 +174,6 @@ def test_surfels_settle_with_two_hits(scene):
     for hits in (0, 1):
         few = Trainer(scene, small(iterations=12, max_hits=hits), "cpu")
         assert few.render_options().max_hits == hits
-
-
-def test_views_are_drawn_without_replacement(scene):
-    trainer, drawn = Trainer(scene, small(iterations=24, exposures=False), "cpu"), []
-    photos = [view.image.float() / 255 for view in scene.train]
-
-    def note(progress: Any) -> None:
-        drawn.append(next(i for i, photo in enumerate(photos) if torch.equal(photo, progress.target)))
-
-    trainer.run(note)
-    epochs = [drawn[:8], drawn[8:16], drawn[16:]]
-    assert all(sorted(epoch) == list(range(8)) for epoch in epochs)
-    assert epochs[0] != epochs[1] != epochs[2]
 
 
 # Scenes

@@ -70,8 +70,6 @@ def test_callbacks_see_each_step_and_stop_the_training(scene: Scene) -> None:
     with pytest.raises(Enough):
         nw.train(scene, SMALL, device="cpu", callbacks=[seen.append, stop])
     assert [step.iteration for step in seen] == [*range(1, 8)]
-    assert all(step.image.shape == step.target.shape and step.psnr() > 0 for step in seen)
-    assert seen[0].loss() == pytest.approx(sum(x.item() for x in seen[0].losses.values()), rel=1e-6)
 
 
 # Losses
@@ -295,12 +293,7 @@ def changed(index: int, value: Any) -> Callable[[list[Any]], list[Any]]:
         ("names", changed(4, "../x"), ValueError, r"^names\[4\]: '../x' leaves the images folder"),
         ("names", changed(4, "view_002.png"), ValueError, r"^names\[4\]: .* 'view_002.png' as of names\[2\]$"),
         ("masks", changed(1, torch.ones(36, 48)), TypeError, r"^masks\[1\]: expected dtype torch.bool"),
-        (
-            "masks",
-            changed(1, torch.zeros(36, 48) > 0),
-            ValueError,
-            r"^masks\[1\]: .* that count, got none$",
-        ),
+        ("masks", changed(1, torch.zeros(36, 48) > 0), ValueError, r"^masks\[1\]: .* that count, got none$"),
         ("test_every", lambda x: 1, ValueError, r"^test_every: expected 0, or at least 2, got 1$"),
     ],
 )
