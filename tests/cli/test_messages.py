@@ -21,19 +21,6 @@ ROOT = Path(__file__).parents[2]
 CLOSED_PIPE = 141
 
 
-@pytest.mark.parametrize(("typed", "meant"), [("trian", "train"), ("rendr", "render"), ("evel", "eval"), ("xyz", None)])
-def test_a_mistyped_command_is_one_line_with_a_suggestion(
-    typed: str, meant: str | None, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as stop:
-        cli.main([typed, "somewhere"])
-    assert stop.value.code == 2
-    err = capsys.readouterr().err
-    assert err.startswith(f"nexwarp: error: no command {typed!r}, expected one of train, eval") and err.count("\n") == 1
-    assert ("; perhaps you meant nexwarp " in err) == (meant is not None)
-    assert meant is None or err.endswith(f"; perhaps you meant nexwarp {meant}\n")
-
-
 @pytest.mark.parametrize("arguments", [["--version"], ["train", "--help"]])
 def test_a_closed_pipe_ends_without_a_traceback(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert arguments != ["--version"] or cli.main(arguments) == 0

@@ -35,6 +35,7 @@ from nexwarp.run.folder import is_run
 from nexwarp.train import recipe
 from nexwarp.train.checkpoint import _read_checkpoint
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
+from tests.cli.support import snapshot
 from tests.scene_writers import write_demo
 
 # Nothing is written while exposures are estimated, SH smoothed and detail limits found, which would take most of such a
@@ -126,11 +127,6 @@ def run(base: Base, words: list[str], kill_after: float | None = None) -> tuple[
     return code, (base.folder / "err").read_text()
 
 
-def files(folder: Path) -> dict[str, bytes]:
-    """Return the files below a folder."""
-    return {str(f.relative_to(folder)): f.read_bytes() for f in sorted(folder.rglob("*")) if f.is_file()}
-
-
 def whole(file: Path) -> bool:
     """Whether a file can be read; True for one of a kind that nexwarp does not read."""
     readers: dict[str, Callable[[Path], object]] = {
@@ -161,13 +157,13 @@ def measured(base: Base, words: list[str]) -> Measured:
         before, begun = base.used(), time.perf_counter()
         code, error = run(base, words)
         assert code == 0, (words, error)
-        return Measured(time.perf_counter() - begun, max(base.used() - before, BLOCK), files(base.disk))
+        return Measured(time.perf_counter() - begun, max(base.used() - before, BLOCK), snapshot(base.disk))
 
 
 def faults(base: Base, words: list[str], normal: Measured, kind: str, share: float) -> Iterator[str]:
     """Break a command down; yield what is wrong then."""
     with base.mounted():
-        before = files(base.disk)
+        before = snapshot(base.disk)
         if kind == "full":
             base.resize((base.used() + int(share * normal.space)) // BLOCK * BLOCK + BLOCK)
         code, error = run(base, words, share * normal.seconds if kind == "kill" else None)
@@ -185,7 +181,7 @@ def faults(base: Base, words: list[str], normal: Measured, kind: str, share: flo
         if code != 0:
             yield f"once more: exit code {code}, {error!r}"
         yield from damage(base, before, normal, killed=True)
-        now = files(base.disk)
+        now = snapshot(base.disk)
         if missing := normal.files.keys() - now.keys() - {"run2/checkpoint.old"}:
             yield f"once more: {sorted(missing)[:3]} are missing"
         if now.get("run2/model.safetensors") != normal.files.get("run2/model.safetensors"):
@@ -194,7 +190,7 @@ def faults(base: Base, words: list[str], normal: Measured, kind: str, share: flo
 
 def damage(base: Base, before: dict[str, bytes], normal: Measured, *, killed: bool) -> Iterator[str]:
     """Yield what is wrong with the files on the disk."""
-    now = files(base.disk)
+    now = snapshot(base.disk)
     for name, content in before.items():
         if name in FOREIGN and now.get(name) != content:
             yield f"{name}: a foreign file was touched"

@@ -75,24 +75,16 @@ def test_buffer_modes_tell_what_the_buffers_hold(model, camera):
 
 
 def test_normals_face_the_camera_and_belong_to_their_surfel(camera):
-    quat = torch.tensor([[0.6, 0.5, -0.2, 0.4]])
-    x, y, z, w = (quat[0, [1, 2, 3, 0]] / quat.norm()).tolist()
-    normal = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
-    to_world = camera_to_world(camera)
-    centre = to_world[:3, 3] + 3.0 * to_world[:3, 2]
-    one = torch.ones(1)
-    surfels = nw.Surfels.from_activated(
-        torch.tensor(centre[None]).float(),
-        quat,
-        2 * torch.ones(1, 2),
-        0.9 * one,
-        torch.ones(1, 2),
-        torch.zeros(1, 1, 3),
-    )
-    picture = drawn(nw.Model(surfels, None, options=OPTIONS), [camera], Settings("normal"))
-    seen = picture.pixels[24, 32] / 255.0 * 2.0 - 1.0
-    expected = normal if normal @ (centre - to_world[:3, 3]) < 0 else -normal
-    np.testing.assert_allclose(seen, expected, atol=1.01 / 127)
+    to_world = torch.from_numpy(camera_to_world(camera)).float()
+    centre, one = to_world[:3, 3] + 3.0 * to_world[:3, 2], torch.ones(1, 2)
+    for quat in ((0.6, 0.5, -0.2, 0.4), (-0.5, 0.6, 0.4, 0.2)):  # the other side
+        shape = (centre[None], torch.tensor([quat]), 2 * one, 0.9 * one[:, 0], one, torch.zeros(1, 1, 3))
+        surfels = nw.Surfels.from_activated(*shape)
+        picture = drawn(nw.Model(surfels, None, options=OPTIONS), [camera], Settings("normal"))
+        normal = surfels.normals[0].detach()
+        assert (normal @ to_world[:3, 2] < 0) == (quat[0] < 0)
+        expected = normal if normal @ to_world[:3, 2] < 0 else -normal
+        np.testing.assert_allclose(picture.pixels[24, 32] / 127.5 - 1.0, expected, atol=1.01 / 127)
 
 
 @pytest.mark.parametrize("mode", MODES)
