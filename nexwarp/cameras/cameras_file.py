@@ -19,9 +19,7 @@ WORLD = (0.0, 0.0, 0.0)
 
 
 def save_cameras(
-    path: Path,
-    cameras: Mapping[str, Mapping[str, Camera]],
-    before: Mapping[str, Mapping[str, Camera]] | None = None,
+    path: Path, cameras: Mapping[str, Mapping[str, Camera]], before: Mapping[str, Mapping[str, Camera]] | None = None
 ) -> None:
     """Write cameras as JSON: set ("train", "test") -> name -> camera, and the `origin` of their frame if it has one.
 

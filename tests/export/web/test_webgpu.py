@@ -18,10 +18,7 @@ from tests.export.web.test_scene_file import damaged
 from tests.scenes import make_camera, make_surfels, random_scene
 from tests.tolerances import FLIPS, WEB_PSNR, assert_close, assert_same_ids
 
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"),
-    pytest.mark.timeout(300),
-]
+pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"), pytest.mark.timeout(300)]
 PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 <script type="importmap">{"imports": {"nexwarp/": "./"}}</script>
 <canvas id="canvas" width="37" height="27"></canvas>
