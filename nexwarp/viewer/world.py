@@ -11,7 +11,7 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.camera import Camera, in_image
 from nexwarp.cameras.paths import focus, up_direction
 from nexwarp.viewer.pacing import MOST_SIDE
 
@@ -139,8 +139,7 @@ def clearest(cameras: Sequence[Camera]) -> Camera:
     covered: list[float] = []
     for camera in chosen:
         pixels, depths = camera.to("cpu", torch.float64).project(centres)
-        size = torch.tensor([camera.width, camera.height])
-        seen = (depths > 0) & ((pixels >= 0) & (pixels < size)).all(-1)
+        seen = in_image(pixels, depths, camera.width, camera.height)
         covered.append(float(depths[seen].square().reciprocal().sum()))
     return chosen[int(np.argmin(np.round(covered, 9)))]
 
