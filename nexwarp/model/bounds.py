@@ -60,23 +60,18 @@ def check_bounds(tensors: Mapping[str, torch.Tensor]) -> None:
                 f"surfels.raw_quats: expected a length of at least {float(SHORTEST):g}, got 0 at index {where}"
             )
     if (falloff := tensors.get("exposures.falloff")) is not None:
-        _check_falloff(*falloff.tolist())
+        a, b, widest = falloff.tolist()
+        if not widest >= SMALLEST_TANGENT:
+            expected = f"a largest squared tangent of at least {SMALLEST_TANGENT:g}"
+            raise ValueError(f"exposures.falloff: expected {expected}, got {widest:g}")
+        # The largest value of a t + b t^2 for t from 0 to 1 is at an end or, of a concave parabola, at its vertex.
+        vertex = -a * a / (4 * b) if b < 0 and 0 < -a / (2 * b) < 1 else 0.0
+        if max(a + b, vertex) > LARGEST_LOG_LIGHT:
+            expected = f"a t + b t^2 of at most {LARGEST_LOG_LIGHT:g}"
+            raise ValueError(f"exposures.falloff: expected {expected}, got a {a:g} and b {b:g}")
     for name, largest in _largest_outputs(tensors):
         if largest > LARGEST_OUTPUT:
             raise ValueError(f"{name}: expected outputs of at most {LARGEST_OUTPUT:g}, got up to {largest:g}")
-
-
-def _check_falloff(a: float, b: float, largest: float) -> None:
-    if not largest >= SMALLEST_TANGENT:
-        raise ValueError(
-            f"exposures.falloff: expected a largest squared tangent of at least {SMALLEST_TANGENT:g}, got {largest:g}"
-        )
-    # The largest value of a t + b t^2 for t from 0 to 1 is at an end or, of a concave parabola, at its vertex.
-    vertex = -a * a / (4 * b) if b < 0 and 0 < -a / (2 * b) < 1 else 0.0
-    if max(a + b, vertex) > LARGEST_LOG_LIGHT:
-        raise ValueError(
-            f"exposures.falloff: expected a t + b t^2 of at most {LARGEST_LOG_LIGHT:g}, got a {a:g} and b {b:g}"
-        )
 
 
 def fits_half(tensors: Mapping[str, torch.Tensor]) -> bool:

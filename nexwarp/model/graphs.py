@@ -17,7 +17,7 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import torch
 from torch import nn
@@ -264,7 +264,6 @@ class CapturedFrame:
     @torch.inference_mode(False)  # later frames write to its tensors in any mode
     @torch.no_grad()
     def __init__(self, graphs: FrameGraphs, frame: Frame, kind: tuple[Hashable, ...]) -> None:
-        assert isinstance(frame.camera, Camera)
         self.graphs, self.state, self.kind = graphs, frame.state, kind
         device = graphs.stream.device
         exposures = frame.exposures if frame.options.exposure == "photos" else None
@@ -285,25 +284,19 @@ class CapturedFrame:
     def take(self, frame: Frame) -> None:
         """Overwrite what the graph reads with another camera and background."""
         camera, background = frame.camera, frame.background
-        assert isinstance(camera, Camera)
         if isinstance(background, torch.Tensor):
             self.camera.copy_(camera)
             self.camera.color.copy_(background.detach().expand(3))
         else:
             self.camera.copy_(camera, color_numbers(background))
         lens = (camera.fx, camera.fy, camera.cx, camera.cy)
-        if self.camera.falloff is not None and self.lens != lens:
-            falloff = None if frame.exposures is None else frame.exposures.falloff_of(camera)
-            assert falloff is not None
-            self.camera.falloff.copy_(falloff)
+        if self.camera.falloff is not None and frame.exposures is not None and self.lens != lens:
+            self.camera.falloff.copy_(cast(torch.Tensor, frame.exposures.falloff_of(camera)))
             self.lens = lens
 
 
 class CapturedRendering(Rendering):
-    """A rendering by a graph. All but the image is copied from the graph's memory when it is first asked for.
-
-    A rendering that is still there when a graph of the model is replayed gets its copies before.
-    """
+    """A rendering by a graph, whose other buffers are copied when asked for, or before the next replay."""
 
     frame: CapturedFrame | None
 
@@ -369,10 +362,7 @@ def without_graphs() -> Iterator[None]:
 
 
 def share_graphs(surfels: Sequence[Surfels]) -> None:
-    """Let the graphs of several models on one GPU share memory from now on; those that they have are dropped.
-
-    The graphs are freed with the last of the models. If a frame of one model cannot be captured, all are dropped.
-    """
+    """Let the graphs of several models on one GPU share memory from now on; those that they have are dropped."""
     with _graphs_lock:
         before = {id(graphs): graphs for each in surfels if (graphs := _graphs.get(each)) is not None}
         graphs = FrameGraphs(surfels[0].device, len(surfels))
@@ -468,10 +458,8 @@ def updating() -> Iterator[None]:
 class StepGraphs:
     """Runs the GPU's part of training steps, as graphs where that pays.
 
-    A step's target, what it compares with, is a dataclass of a `camera`, tensors, and values on which the launches
-    depend. Where only tensors have been replaced, as by a round of density control, the first step after it is
-    captured. Where memory does not suffice for graphs, or a step cannot be captured, all later steps are launched
-    kernel by kernel.
+    A step's target is a dataclass of a `camera`, tensors, and values on which the launches depend. Where only tensors
+    have been replaced, as by a round of density control, the first step after it is captured.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -614,11 +602,7 @@ def can_capture(optimizer: torch.optim.Optimizer) -> bool:
 def graph_key(
     options: RenderOptions, optimizer: torch.optim.Optimizer, tensors: Sequence[torch.Tensor], *, densify: bool
 ) -> GraphKey:
-    """Return the key of a step.
-
-    A step reads and writes the optimizer's moments and `tensors`, the parameters and the densifier's sums; `densify`
-    says whether it adds to these sums.
-    """
+    """Return the key of a step on `tensors`: the parameters and the sums that it adds to if `densify`."""
     moments = [x for state in optimizer.state.values() for x in state.values() if isinstance(x, torch.Tensor)]
     return GraphKey(
         (densify, options.max_hits, options.sh_degree, torch.are_deterministic_algorithms_enabled()),

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from statistics import fmean
-from typing import TypedDict, cast
+from typing import Any, TypedDict, cast
 
 import torch
 from safetensors import SafetensorError
@@ -90,11 +90,18 @@ def evaluate(
         for view, (picture, values) in zip(group, _gathered(mine, group, ranks), strict=True):
             results[view.name] = values
             if renders is not None and ranks.first:
-                _write(renders, view, picture, *_compared(model, view, mask_mode))
+                photo, mask = _compared(model, view, mask_mode)
+                captions = ["photo", f"render {psnr(picture, photo, mask):.2f} dB", "error (0 to 0.25)"]
+                strip = side_by_side([photo, picture, error_map(picture, photo)], captions=captions)
+                save_png(renders / TEST / picture_name(view.name), picture)
+                save_png(renders / COMPARE / picture_name(view.name), strip)
             if progress is not None:
                 progress(view.name)
-    means = {name: _mean([values[name] for values in results.values()]) for name in metrics}
-    return cast(Evaluation, {**means, "views": results, "convention": CONVENTION})
+    summary: dict[str, Any] = {"views": results, "convention": CONVENTION}
+    for name in metrics:
+        known = [value for values in results.values() if (value := values[name]) is not None]
+        summary[name] = fmean(known) if len(known) == len(results) else None
+    return cast(Evaluation, summary)
 
 
 def _judge(model: Model, view: View, mask_mode: str, metrics: Sequence[str]) -> tuple[torch.Tensor, Values]:
@@ -117,9 +124,6 @@ def _gathered(
     mine: tuple[torch.Tensor, Values] | None, views: Sequence[View], ranks: Ranks
 ) -> list[tuple[torch.Tensor, Values]]:
     """Return what each rank has made of its view; None is a rank without one."""
-    if ranks.size == 1:
-        assert mine is not None
-        return [mine]
     values = ranks.gather(None if mine is None else mine[1])
     pictures = ranks.gather_bytes(b"" if mine is None else mine[0].contiguous().numpy().tobytes())
     return [
@@ -129,21 +133,6 @@ def _gathered(
         )
         for view, pixels, value in zip(views, pictures, values, strict=False)
     ]
-
-
-def _write(renders: Path, view: View, picture: torch.Tensor, photo: torch.Tensor, mask: torch.Tensor | None) -> None:
-    """Write a rendering, and the strip that compares it with its photo."""
-    save_png(renders / TEST / picture_name(view.name), picture)
-    strip = side_by_side(
-        [photo, picture, error_map(picture, photo)],
-        captions=["photo", f"render {psnr(picture, photo, mask):.2f} dB", "error (0 to 0.25)"],
-    )
-    save_png(renders / COMPARE / picture_name(view.name), strip)
-
-
-def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return fmean(known) if len(known) == len(values) else None
 
 
 def psnr(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float:

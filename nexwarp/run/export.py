@@ -73,16 +73,13 @@ def export_run(
     """
     order.check()
     folder = order.out or opened.folder / EXPORT_FOLDER
-    return [*_export(opened, order, folder, device, observe), *_export_origin(opened, order, folder)]
-
-
-def _export_origin(opened: OpenedModel, order: ExportOrder, folder: Path) -> list[Path]:
-    """Write where the frame of exported positions lies in the world, unless it is the world's or the file says so."""
-    if order.format in ("compact", "cameras") or not any(opened.model.origin or ()):
-        return []
-    file = (folder.parent if folder.suffix == ".html" else folder) / ORIGIN_FILE
-    write_json(file, {"origin": opened.model.origin, "meaning": "world position = origin + exported position"})
-    return [file]
+    files = [*_export(opened, order, folder, device, observe)]
+    # Compact models and cameras say themselves where their frame lies in the world.
+    if order.format not in ("compact", "cameras") and any(opened.model.origin or ()):
+        files.append((folder.parent if folder.suffix == ".html" else folder) / ORIGIN_FILE)
+        meaning = "world position = origin + exported position"
+        write_json(files[-1], {"origin": opened.model.origin, "meaning": meaning})
+    return files
 
 
 def _export(
@@ -90,7 +87,10 @@ def _export(
 ) -> Sequence[Path]:
     """Write the files of a format."""
     files = [folder / name for name in EXPORTS[order.format]]
-    views = _all_cameras(opened) if order.format not in ("compact", "mesh", "cameras") else {}
+    views: dict[str, Camera] = {}
+    # A training that stopped early leaves no cameras file.
+    if order.format not in ("compact", "mesh", "cameras") and (opened.folder / CAMERAS_FILE).is_file():
+        views = {name: camera for members in opened.cameras.values() for name, camera in members.items()}
     if order.format == "web":
         from nexwarp.export.web.export import export_web
 
@@ -112,19 +112,12 @@ def _export(
         cameras = list(views.values())
         save_glb(files[0], bake(opened.model.to(device), cameras), cameras)
     else:
-        _export_splats(opened, files, list(views.values()), order.max_extent)
+        surfels, degree = opened.model.surfels, min(opened.model.options.sh_degree, SPLAT_DEGREE)
+        if order.format == "ply":
+            save_surfels_ply(files[0], surfels)
+        save = save_splats_ply if order.format == "ply" else save_splats_spz
+        save(files[-1], surfels, degree, cameras=list(views.values()), max_extent=order.max_extent)
     return files
-
-
-def _export_splats(opened: OpenedModel, files: list[Path], cameras: list[Camera], max_extent: float) -> None:
-    """Write splats.spz, or surfels.ply and splats.ply."""
-    surfels = opened.model.surfels
-    degree = min(opened.model.options.sh_degree, SPLAT_DEGREE)
-    if files[0].suffix == ".spz":
-        save_splats_spz(files[0], surfels, degree, cameras=cameras, max_extent=max_extent)
-    else:
-        save_surfels_ply(files[0], surfels)
-        save_splats_ply(files[1], surfels, degree, cameras=cameras, max_extent=max_extent)
 
 
 def _export_cameras(opened: OpenedModel, transforms: Path, camera_path: Path) -> None:
@@ -169,10 +162,3 @@ def _originals(opened: OpenedModel) -> tuple[dict[str, str], dict[str, JsonObjec
             names[name] = photo.file.relative_to(folder).as_posix()
             lenses[names[name]] = keys
     return names, lenses
-
-
-def _all_cameras(opened: OpenedModel) -> dict[str, Camera]:
-    """Return the cameras of a run by name; none of a training that stopped early, which leaves no cameras file."""
-    if not (opened.folder / CAMERAS_FILE).is_file():
-        return {}
-    return {name: camera for members in opened.cameras.values() for name, camera in members.items()}

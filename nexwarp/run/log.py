@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import torch
 
@@ -38,11 +38,15 @@ class TrainingLog:
         self.tensorboard = tensorboard
         self.every = max(min(EVERY, trainer.config.iterations // MIN_LINES), 1)
         self.file: TextIO | None = None
-        self.events: TensorboardEvents | None = None
+        self.events: Any = None
 
     def __enter__(self) -> "TrainingLog":
         if self.tensorboard:
-            self.events = TensorboardEvents(self.path.parent, self.trainer.iteration)
+            from torch.utils.tensorboard import SummaryWriter
+
+            # Events after this iteration, which is trained again, are hidden.
+            hidden = self.trainer.iteration + 1 if self.trainer.iteration else None
+            self.events = SummaryWriter(str(self.path.parent / TENSORBOARD_FOLDER), purge_step=hidden)
         self._open()
         return self
 
@@ -77,7 +81,9 @@ class TrainingLog:
         self.file.write(json.dumps(line, allow_nan=False) + "\n")
         self.file.flush()
         if self.events is not None:
-            self.events.write(_scalars(line), step.iteration)
+            for name, value in _scalars(line).items():
+                self.events.add_scalar(name, value, step.iteration)
+            self.events.flush()
 
     def _line(self, step: StepReport) -> dict[str, Json]:
         # One transfer for all terms. It waits for the step, so the clock is read after it.
@@ -165,21 +171,3 @@ def check_tensorboard() -> None:
         raise SettingError(
             "--tensorboard: expected the package tensorboard, found none; pip install 'nexwarp[tensorboard]'"
         )
-
-
-class TensorboardEvents:
-    """Writes events to a run's folder `tensorboard`; events after `iteration`, which are trained again, are hidden."""
-
-    def __init__(self, run: Path, iteration: int) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
-        self.writer: SummaryWriter = SummaryWriter(
-            str(run / TENSORBOARD_FOLDER), purge_step=iteration + 1 if iteration else None
-        )
-        self.close = self.writer.close
-
-    def write(self, scalars: Mapping[str, float], iteration: int) -> None:
-        """Write values by name."""
-        for name, value in scalars.items():
-            self.writer.add_scalar(name, value, iteration)
-        self.writer.flush()

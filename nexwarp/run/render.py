@@ -153,9 +153,8 @@ class RenderOrder:
                 camera = resized(size(camera), first.width, first.height)
                 pictures.append(PictureJob(folder / f"{index:04d}.png", camera, True, buffers))
         if not pictures:
-            raise RunError(
-                f"{opened.folder / CAMERAS_FILE}: expected {self.views} views to render, found none; see --path"
-            )
+            file = opened.folder / CAMERAS_FILE
+            raise RunError(f"{file}: expected {self.views} views to render, found none; see --path")
         return RenderJob(pictures, self, fps if self.fps is None else self.fps)
 
     def _path(self, name: str, opened: OpenedModel, renders: Path) -> tuple[Path, list[Camera], float]:
@@ -230,11 +229,8 @@ class RenderJob:
     def render(self, model: Model, done: Callable[[], object] = lambda: None) -> None:
         """Render and write all images and the video, and call `done` after each. An incomplete video is deleted."""
         frames = [picture for picture in self.pictures if picture.is_frame]
-        changes: RenderChanges = {}
-        if self.order.exposure is not None:
-            changes["exposure"] = cast(Exposure, self.order.exposure)
-        if self.order.order is not None:
-            changes["order"] = cast(Order, self.order.order)
+        asked = {"exposure": self.order.exposure, "order": self.order.order}
+        changes = cast(RenderChanges, {name: value for name, value in asked.items() if value is not None})
         with ExitStack() as stack:
             append = None
             if self.order.video is not None:  # before any rendering, which would be lost if it cannot be written
@@ -252,8 +248,10 @@ class RenderJob:
                 if append is not None and picture.is_frame:
                     append(pixels)
                 done()
-        if frames:
-            _remove_frames(frames[0].file.parent, len(frames))
+        if frames:  # an earlier, longer path may have left others
+            for file in frames[0].file.parent.iterdir():
+                if re.fullmatch(r"\d{4,}\.(png|exr)", file.name) and int(file.stem) >= len(frames):
+                    file.unlink()
 
 
 def projected(order: RenderOrder, camera: Camera) -> Camera | RayCamera:
@@ -267,10 +265,3 @@ def projected(order: RenderOrder, camera: Camera) -> Camera | RayCamera:
         K = torch.tensor([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
         return RayCamera.fisheye(viewmat, K.to(viewmat), (0, 0, 0, 0), *size, near=camera.near)
     return camera
-
-
-def _remove_frames(folder: Path, count: int) -> None:
-    """Remove the frames numbered `count` and up, which an earlier, longer path left in the folder."""
-    for file in folder.iterdir():
-        if re.fullmatch(r"\d{4,}\.(png|exr)", file.name) and int(file.stem) >= count:
-            file.unlink()
