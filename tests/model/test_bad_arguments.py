@@ -200,12 +200,3 @@ def test_render_refuses_to_mix_dtypes() -> None:
     assert_refused(TypeError, "texture", nw.render, surfels, make_texture(dtype=torch.float64), camera)
     assert_refused(TypeError, "camera|viewmat", nw.render, surfels, None, make_camera(double))
     assert_refused(TypeError, "surfels|means", nw.render, surfels.half(), None, camera)
-
-
-@pytest.mark.cuda
-def test_render_refuses_to_mix_cuda_and_cpu() -> None:
-    scene, there = random_scene(4), random_scene(4, device="cuda")
-    surfels = make_surfels(scene)
-    assert_refused(ValueError, "camera|viewmat", nw.render, surfels, None, make_camera(there))
-    camera = make_camera(scene)
-    assert_refused(ValueError, "texture", nw.render, surfels, make_texture(device="cuda"), camera)

@@ -15,6 +15,7 @@ from nexwarp.cameras.camera import StagedCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.model import graphs as frames
 from nexwarp.model.exposures import Exposures
+from nexwarp.model.options import RenderChanges
 from nexwarp.model.render import Rendering, draw
 from tests.narrowing import neural, present
 from tests.render_support import BUFFERS, assert_same
@@ -133,7 +134,7 @@ def test_an_image_alone_is_that_of_the_rendering(device: torch.device) -> None:
 
 @CUDA
 def test_images_alone_keep_less_and_leave_other_renderings_alone() -> None:
-    camera, held = cameras("cuda", 1, width=640, height=480)[0], {}
+    camera, sizes = cameras("cuda", 1, width=640, height=480)[0], {}
     for name in ("render", "render_image"):
         model = finished("cuda")
         with torch.no_grad():
@@ -142,16 +143,14 @@ def test_images_alone_keep_less_and_leave_other_renderings_alone() -> None:
             gc.collect()
             before = torch.cuda.memory_allocated()
             getattr(model, name)(camera)  # captured
-        held[name] = torch.cuda.memory_allocated() - before
-    assert 640 * 480 * 3 * 4 <= held["render_image"] < 0.2 * held["render"]
+        sizes[name] = torch.cuda.memory_allocated() - before
+    assert 640 * 480 * 3 * 4 <= sizes["render_image"] < 0.2 * sizes["render"]
     with torch.no_grad():
-        whole = [model.render(camera) for _ in range(3)][-1]
-        with frames.without_graphs():
-            expected = model.render(camera)
+        held = [model.render(camera) for _ in range(3)][-1]
         for _ in range(3):
-            assert torch.equal(model.render_image(camera), expected.image)
-    assert_same(whole, expected, (*BUFFERS, "ids", *LATER))
-    assert len(graphs(model).frames) == 3  # one of them is of the small cameras
+            image = model.render_image(camera)
+    assert torch.equal(image, held.image) and len(graphs(model).frames) == 3  # one is of the small cameras
+    assert_same(held, both(model, camera)[1], (*BUFFERS, "ids", *LATER))
 
 
 @CUDA
@@ -189,34 +188,21 @@ def test_models_that_share_graphs_take_less_memory_and_keep_their_own_pictures()
 
 @CUDA
 def test_renderings_outlive_the_next_frames(model: nw.Model) -> None:
-    views = cameras("cuda")
-    with torch.no_grad():
-        outs = [model.render(camera) for camera in (*views, *views)]
-        images = [model.render(camera).image for camera in views]
-        with frames.without_graphs():
-            expected = [model.render(camera) for camera in views]
-    assert all(isinstance(out, frames.CapturedRendering) for out in outs)
-    assert "depths" not in vars(outs[-1]), "copied before it was asked for"
-    outs.append(copy.deepcopy(outs[-1]))
-    with pytest.raises(AttributeError, match="'CapturedRendering' object has no attribute 'depth'"):
-        _ = outs[0].depth
-    for out, same in zip(outs, (*expected, *expected, expected[-1]), strict=True):
-        assert_same(out, same, (*BUFFERS, "ids", *LATER))
-    assert all(torch.equal(image, out.image) for image, out in zip(images, expected, strict=True))
-
-
-@CUDA
-def test_renderings_of_other_sizes_do_not_overwrite_each_other(model: nw.Model) -> None:
     """All graphs share the memory of their temporary buffers, in which another one may have its results."""
-    views = [cameras("cuda", 1, width=width, height=45)[0] for width in (61, 33, 90)]
+    views = [*cameras("cuda", 2), *(cameras("cuda", 1, width=width)[0] for width in (33, 90))]
+    options: list[RenderChanges] = [{"max_hits": hits} for hits in (2, 2, 4, 1)]
     with torch.no_grad():
         with frames.without_graphs():
-            expected = [model.render(camera, max_hits=k) for camera, k in zip(views, (2, 4, 1), strict=True)]
+            expected = [model.render(view, **changes) for view, changes in zip(views, options, strict=True)]
         for _ in range(4):
-            outs = [model.render(camera, max_hits=k) for camera, k in zip(views, (2, 4, 1), strict=True)]
-            for out, same in zip(reversed(outs), reversed(expected), strict=True):
-                assert_same(out, same, (*BUFFERS, "ids", *LATER))
-    assert len(graphs(model).frames) == 3
+            outs = [model.render(view, **changes) for view, changes in zip(views, options, strict=True)]
+    assert all(isinstance(out, frames.CapturedRendering) for out in outs) and len(graphs(model).frames) == 3
+    assert "depths" not in vars(outs[-1]), "copied before it was asked for"
+    with pytest.raises(AttributeError, match="'CapturedRendering' object has no attribute 'depth'"):
+        _ = outs[0].depth  # type: ignore[attr-defined]
+    outs.append(copy.deepcopy(outs[-1]))
+    for out, same in zip(outs, [*expected, expected[-1]], strict=True):
+        assert_same(out, same, (*BUFFERS, "ids", *LATER))
 
 
 @CUDA

@@ -81,8 +81,8 @@ def test_files_of_another_kind(tmp_path):
     ):
         file.write_bytes(content)
         refused(ValueError, nw.load, tmp_path, names=file, match="expected a safetensors file")
-    for header in (None, "{", "[]", "3", '"text"'):
-        safetensors.torch.save_file({"x": torch.zeros(3)}, file, header and {"nexwarp": header})
+    for metadata in (None, *({"nexwarp": header} for header in ("{", "[]", "3", '"text"'))):
+        safetensors.torch.save_file({"x": torch.zeros(3)}, file, metadata)
         refused(ValueError, nw.load, file, names=file, match="metadata")
 
 

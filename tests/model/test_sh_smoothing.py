@@ -12,7 +12,7 @@ from nexwarp.cameras.paths import look_at
 from nexwarp.data import Scene, View
 from nexwarp.model.surfels import Surfels
 from nexwarp.train.finish import seen_directions, smooth_sh
-from nexwarp.train.recipe import MAX_STRENGTH, MIN_STRENGTH, Config, TextureConfig
+from nexwarp.train.recipe import MIN_STRENGTH, Config, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.reference.sh import basis as sh_basis
 from tests.scene_writers import write_demo
@@ -109,21 +109,6 @@ def test_coefficients_are_those_of_ridge_regression(device: torch.device, streng
     assert torch.equal(surfels.sh, before)
     # Harmonics of float32: what their last bits tell of unseen directions grows as strength falls.
     assert (found - expected).abs().max() < 1e-4 < (found - before[0].double().cpu()).abs().max()
-
-
-def test_what_is_even_stays_and_the_strongest_smoothing_leaves_one_colour(device: torch.device) -> None:
-    surfels, views = blob(device), around([-0.5, 0.0, 0.5])
-    sh0, shN = smooth_sh(nw.Model(surfels, None), views, MAX_STRENGTH)
-    assert shN.abs().max() < 1e-5
-    learnt = colors(surfels, views, (surfels.sh0, surfels.shN))[:, 0]
-    flat = colors(surfels, views, (sh0, shN))[0, 0]
-    assert ((flat > learnt.amin(0) - 1e-4) & (flat < learnt.amax(0) + 1e-4)).all()  # a mean of what views show
-    with torch.no_grad():
-        surfels.sh0.copy_(sh0)
-        surfels.shN.zero_()
-    again = smooth_sh(nw.Model(surfels, None), views, 0.01)
-    assert_close(again[0], sh0, kind="value", name="sh0")
-    assert again[1].abs().max() < 1e-6
 
 
 def test_unseen_surfels_get_one_colour_and_none_are_no_trouble(device: torch.device) -> None:
