@@ -24,7 +24,7 @@ from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
 from nexwarp.train.initial import starting_points
 from nexwarp.train.losses import SATURATION
 from nexwarp.train.recipe import Config
-from nexwarp.train.views import TrainingViews, mean_color
+from nexwarp.train.target import TrainingViews, mean_color
 
 FLOATS = {"3dgs": 11, "2dgs": 10}  # a primitive without SH: means 3, quats 4, scales 3 or 2, opacity 1
 NEAR = {"3dgs": 0.01, "2dgs": 0.2}  # the examples' near planes, in the normalised frame

@@ -17,7 +17,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.run.evaluate import METRICS, psnr
-from nexwarp.train.stages import StageStore, stage_runner
+from nexwarp.train.stages import StageRunner, StageStore
 
 RenderImage = Callable[[Camera], torch.Tensor]  # (H, W, 3), not clamped, on any device
 
@@ -76,7 +76,7 @@ def file_name(job: TrainingJob) -> str:
 def _train_nexwarp(
     job: TrainingJob, row: Row, scene: Scene, device: torch.device, models: Path | None
 ) -> tuple[RenderImage, dict[str, Any]]:
-    runner = stage_runner(scene, config_of(job, row), device, StageStore())
+    runner = StageRunner(scene, config_of(job, row), device, StageStore())
     runner.train_teachers()
     trainer = runner.trainer
     trainer.run()

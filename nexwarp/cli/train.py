@@ -38,7 +38,7 @@ from nexwarp.train.ranks.launch import check_count, is_rank
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import DEMO_SETTINGS, Config, preset
 from nexwarp.train.settings import parse_settings, setting, with_settings
-from nexwarp.train.stages import NO_TEACHERS, StageRunner, plan_teachers, stage_runner
+from nexwarp.train.stages import NO_TEACHERS, StageRunner, plan_teachers
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
@@ -139,7 +139,7 @@ class Train:
             session = Session(
                 run, record, console, ranks, resume=resume, tensorboard=self.tensorboard, every=self.checkpoint_every
             )
-            runner = stage_runner(
+            runner = StageRunner(
                 scene, record.config, ranks.device, session, own=record.own, ranks=ranks, teachers=teachers, **start
             )
             if ranks.first and resume:

@@ -13,7 +13,7 @@ from nexwarp.train.losses import OwnLoss
 from nexwarp.train.optimizer import OptimizerMaker
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
-from nexwarp.train.stages import StageStore, stage_runner
+from nexwarp.train.stages import StageRunner, StageStore
 
 Callback = Callable[[StepReport], object]
 
@@ -75,28 +75,21 @@ def train(
         raise TypeError(f"scene: expected a nexwarp.Scene, got {type(scene).__name__}")
     if config is not None and not isinstance(config, Config):
         raise TypeError(f"config: expected a nexwarp.Config or None, got {type(config).__name__}")
-    config, observe = config or Config(), _observer(callbacks)
-    check_start(scene, config, start)
-    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
-
-    def warn(message: str) -> None:
-        warnings.warn(message, stacklevel=2)
-
-    store = StageStore(observe, warn)
-    runner = stage_runner(scene, config, device, store, losses=losses, optimizer=optimizer, teachers=teachers, **start)
-    runner.train()
-    return runner.finish()
-
-
-def _observer(callbacks: Iterable[Callback]) -> Callable[[StepReport], None]:
-    """Return a function that calls all callbacks; TypeError for one that is no function."""
-    observers = list(callbacks)
+    config, observers = config or Config(), list(callbacks)
     for index, callback in enumerate(observers):
         if not callable(callback):
             raise TypeError(f"callbacks[{index}]: expected a function, got {type(callback).__name__}")
+    check_start(scene, config, start)
+    device = device or ("cuda" if torch.cuda.is_available() else "cpu")
 
     def observe(report: StepReport) -> None:
         for callback in observers:
             callback(report)
 
-    return observe
+    def warn(message: str) -> None:
+        warnings.warn(message, stacklevel=2)
+
+    store = StageStore(observe, warn)
+    runner = StageRunner(scene, config, device, store, losses=losses, optimizer=optimizer, teachers=teachers, **start)
+    runner.train()
+    return runner.finish()

@@ -28,7 +28,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NEVER, DetailLimits
 from nexwarp.train.recipe import Config
-from nexwarp.train.views import with_cameras
+from nexwarp.train.target import with_cameras
 
 PRODUCTS = 2**26  # values of the normal equations held at once, float64: 0.5 GiB
 SOLVED = 2**21  # values of the matrices solved at once, several times

@@ -1,25 +1,25 @@
 """Adam in one kernel for each parameter; learning rates and schedules over a run."""
 
+import dataclasses
 import inspect
 import math
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import torch
 
-from nexwarp.model.options import RenderOptions
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture, Texture
 from nexwarp.ops.adam import Moments, adam_step
-from nexwarp.ops.tiles import Order
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config, LossWeights
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
 # "means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN", "grid", "mlp" (or "texture", of a
 # texture of one's own) and, where they are learned, "poses"; `lr`, the learning rate of the first step.
 ParameterGroup = dict[str, Any]
-EPSILON = 1e-15
+EPSILON = 1e-15  # the paper's
+RATED = (*PARAMETERS, "grid", "mlp")  # the groups of the fields of `LearningRates`, in their order
 # First and last learning rates of pose corrections, radians and scene scales, in a run of 30,000 steps.
 POSE_RATES = (2e-4, 2e-6)
 OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
@@ -137,7 +137,9 @@ def make_optimizer(
     if poses is not None:
         parts["poses"] = [poses.corrections]
     groups: list[ParameterGroup] = [{"params": x, "name": name, "lr": ends[name][0]} for name, x in parts.items()]
-    optimizer = _make_adam(groups, surfels.device) if make is None else make(groups)
+    if make is None and surfels.device.type == "cuda":  # rates that a CUDA graph reads
+        groups = [group | {"lr": torch.tensor(group["lr"], device=surfels.device)} for group in groups]
+    optimizer = FusedAdam(groups, eps=EPSILON) if make is None else make(groups)
     if not isinstance(optimizer, torch.optim.Optimizer):
         raise TypeError(f"optimizer: expected it to return a torch.optim.Optimizer, got {type(optimizer).__name__}")
     expected = {name: {id(x) for x in values} for name, values in parts.items()}
@@ -145,43 +147,24 @@ def make_optimizer(
         names = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
         raise ValueError(f"optimizer: expected it to keep the parameter groups {', '.join(parts)}, got {names}")
     for group in optimizer.param_groups:
-        group["ends"] = _scaled_ends(ends[group["name"]], float(group["lr"]))
+        first, last = ends[group["name"]]
+        rate = float(group["lr"])
+        if not math.isclose(rate, first, rel_tol=1e-6):  # it was changed; a rate on the GPU is rounded to float32
+            first, last = rate, rate * last / first if first else rate
+        group["ends"] = first, last
     if isinstance(optimizer, FusedAdam) and isinstance(texture, NeuralTexture) and config.max_hits:
         optimizer.regularise(texture, grid_factors(texture, config.losses, cells_unit))
     return optimizer
 
 
-def _make_adam(groups: list[ParameterGroup], device: torch.device) -> FusedAdam:
-    """Make Adam with the paper's epsilon; on CUDA, its rates are tensors, which a CUDA graph reads."""
-    if device.type == "cuda":
-        groups = [group | {"lr": torch.tensor(group["lr"], device=device)} for group in groups]
-    return FusedAdam(groups, eps=EPSILON)
-
-
-def _scaled_ends(ends: tuple[float, float], rate: float) -> tuple[float, float]:
-    """Return the first and last rate of a group whose first rate may have been changed; their ratio is kept."""
-    if math.isclose(rate, ends[0], rel_tol=1e-6):  # a rate on the GPU is rounded to float32
-        return ends
-    return (rate, rate) if ends[0] == 0 else (rate, rate * ends[1] / ends[0])
-
-
 def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
     """Return the learning rates of a run's first and last step by group; the means' follow the scene's scale."""
-    rates = config.rates
+    rates = dataclasses.astuple(config.rates)
+    ends = {name: x if isinstance(x, tuple) else (x, x) for name, x in zip(RATED, rates, strict=True)}
     # Adam moves a pose by at most its rate a step: a short run needs longer steps.
     longer = math.sqrt(REFERENCE_ITERATIONS / config.iterations)
-    return {
-        "means": (rates.means[0] * scale, rates.means[1] * scale),
-        "raw_quats": (rates.quats,) * 2,
-        "log_scales": (rates.scales,) * 2,
-        "logit_opacities": (rates.opacities,) * 2,
-        "raw_gammas": (rates.gammas,) * 2,
-        "sh0": (rates.sh0,) * 2,
-        "shN": (rates.shN,) * 2,
-        "grid": rates.grid,
-        "mlp": rates.mlp,
-        "poses": (POSE_RATES[0] * longer, POSE_RATES[1] * longer),
-    }
+    ends["poses"] = POSE_RATES[0] * longer, POSE_RATES[1] * longer
+    return ends | {"means": (ends["means"][0] * scale, ends["means"][1] * scale)}
 
 
 def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int, factor: float) -> None:
@@ -195,16 +178,3 @@ def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int,
             group["lr"].fill_(rate)
         else:
             group["lr"] = rate
-
-
-def options_at(
-    config: Config, iteration: int, background: tuple[float, float, float], texture_degree: int
-) -> RenderOptions:
-    """Return how the scene is rendered after an iteration: more hits and SH degrees are unlocked on the way."""
-    unlocked = iteration // config.scaled(config.sh_every)
-    return RenderOptions(
-        max_hits=config.hits_at(iteration),
-        background=background,
-        sh_degree=min(max(config.sh_degree, texture_degree), unlocked),
-        order=cast(Order, config.order),
-    )

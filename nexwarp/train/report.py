@@ -1,7 +1,7 @@
 """What a training step reports, and the health of a training: numbers that are not finite, lacking memory."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -68,20 +68,6 @@ def not_finite(tensors: Mapping[str, torch.Tensor]) -> list[str]:
     # A maximum hands NaN on, and cannot overflow as a sum does.
     largest = torch.stack([torch.linalg.vector_norm(x, math.inf).float() for x in filled.values()])
     return [name for name, x in zip(filled, largest.tolist(), strict=True) if not math.isfinite(x)]
-
-
-def watched_tensors(
-    parameters: Iterable[tuple[str, torch.Tensor]], optimizer: torch.optim.Optimizer
-) -> dict[str, torch.Tensor]:
-    """Return parameters and optimizer state, which must stay finite, by the names that messages give them."""
-    watched: dict[str, torch.Tensor] = {}
-    for name, parameter in parameters:
-        # The gradient itself is freed by now; a gradient that is not finite shows in the optimizer's state.
-        for key, value in optimizer.state.get(parameter, {}).items():
-            if isinstance(value, torch.Tensor) and value.shape == parameter.shape:
-                watched[f"{key} of {name}"] = value
-        watched[name] = parameter
-    return watched
 
 
 def oom_message(state: TrainingState, needed: str, *, graphs: bool) -> str:

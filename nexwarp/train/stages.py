@@ -4,7 +4,7 @@ Not in the paper. What a student learns from teachers is in `nexwarp.train.teach
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -15,7 +15,7 @@ from nexwarp.data import Scene
 from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.machine import derived_seed
 from nexwarp.model.model import Model
-from nexwarp.train.exposure import ExposureCalibration, calibrate_exposures
+from nexwarp.train.exposure import calibrate_exposures
 from nexwarp.train.initial import Start
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.ranks.ranks import Ranks
@@ -139,19 +139,30 @@ class StageRunner:
 
     def __init__(
         self,
-        stages: Sequence[Stage],
-        make: Callable[[Stage, Sequence[Model]], Trainer],
+        scene: Scene,
+        config: Config,
+        device: torch.device | str,
         store: StageStore,
-        teachers: Sequence[Model] = (),
+        *,
+        own: OwnTeachers | None = None,
+        ranks: Ranks | None = None,
+        teachers: Iterable[Model] = (),
+        **extensions: Any,
     ) -> None:
         """Make the trainer of the first stage that is not complete; no step is done yet.
 
-        `make` makes a trainer of a stage and models to learn from; the student learns from `teachers` where the run
-        trains none of its own.
+        `own` are the teachers that the run trains: None plans them, or none where `teachers`, models, are given
+        instead. `extensions` are `losses` and `optimizer` of `nexwarp.train`, and what the student starts from.
         """
-        self.stages, self.make, self.store, self.teachers = stages, make, store, teachers
+        self.scene, self.device, self.store, self.ranks, self.extensions = scene, device, store, ranks, extensions
+        # `Trainer` says what is wrong with it.
+        self.teachers: Any = teachers if isinstance(teachers, Model) else list(teachers)
+        if own is None:
+            own = NO_TEACHERS if self.teachers else plan_teachers(config, len(scene.train))
+        self.calibration = cache(lambda: calibrate_exposures(scene, config))
+        self.stages = divide(config, own)
         self.models: list[Model] = []
-        for stage in stages[:-1]:
+        for stage in self.stages[:-1]:
             model = store.complete(stage)
             if model is None:
                 break
@@ -160,7 +171,14 @@ class StageRunner:
 
     def _begin(self) -> None:
         self.stage = self.stages[len(self.models)]
-        self.trainer = self.make(self.stage, () if self.stage.teacher else self.models or self.teachers)
+        options = self.extensions | {"teachers": self.models or self.teachers}
+        if self.stage.teacher:
+            options = {name: x for name, x in options.items() if name not in (*Start.__annotations__, "teachers")}
+        options["calibrate"] = lambda *_: self.calibration()
+        if self.ranks is None or self.ranks.size == 1:
+            self.trainer = Trainer(self.scene, self.stage.config, self.device, **options)
+        else:
+            self.trainer = ParallelTrainer(self.scene, self.stage.config, self.device, self.ranks, **options)
         self.store.begin(self.stage, self.trainer)
 
     def train_teachers(self) -> None:
@@ -183,38 +201,3 @@ class StageRunner:
     def finish(self) -> Model:
         """Return the finished model of the student."""
         return self.store.finish(self.stage, self.trainer)
-
-
-def stage_runner(
-    scene: Scene,
-    config: Config,
-    device: torch.device | str,
-    store: StageStore,
-    *,
-    own: OwnTeachers | None = None,
-    ranks: Ranks | None = None,
-    teachers: Iterable[Model] = (),
-    **extensions: Any,
-) -> StageRunner:
-    """Return the runner of a training.
-
-    `own` are the teachers that the run trains: None plans them, or none where `teachers`, models, are given instead.
-    `extensions` are `losses` and `optimizer` of `nexwarp.train`, and what the student starts from.
-    """
-    models: Any = teachers if isinstance(teachers, Model) else list(teachers)  # `Trainer` says what is wrong with it
-    if own is None:
-        own = NO_TEACHERS if models else plan_teachers(config, len(scene.train))
-
-    @cache
-    def calibration() -> ExposureCalibration | None:
-        return calibrate_exposures(scene, config)
-
-    def make(stage: Stage, learned_from: Sequence[Model]) -> Trainer:
-        options = {**extensions, "teachers": learned_from, "calibrate": lambda *_: calibration()}
-        if stage.teacher:
-            options = {name: x for name, x in options.items() if name not in Start.__annotations__}
-        if ranks is None or ranks.size == 1:
-            return Trainer(scene, stage.config, device, **options)
-        return ParallelTrainer(scene, stage.config, device, ranks, **options)
-
-    return StageRunner(divide(config, own), make, store, models)

@@ -2,16 +2,14 @@
 
 import dataclasses
 import hashlib
-import os
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
-from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene
 from nexwarp.errors import CheckpointError, check_finite
 from nexwarp.io.files import one_line
@@ -21,10 +19,11 @@ from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture, Texture
+from nexwarp.ops.tiles import Order
 from nexwarp.train.checkpoint import Snapshot
 from nexwarp.train.densify import DensityControl
 from nexwarp.train.initial import Start, cells_unit, given_surfels, initial_poses, initial_surfels, initial_texture
-from nexwarp.train.optimizer import FusedAdam, OptimizerMaker, make_optimizer, options_at
+from nexwarp.train.optimizer import FusedAdam, OptimizerMaker, make_optimizer
 from nexwarp.train.recipe import Config
 from nexwarp.train.settings import config_from_dict, refuse_removed
 
@@ -128,12 +127,15 @@ class TrainingState:
         return Model(self.surfels, self.texture, options=self.render_options(), meta=self.facts())
 
     def render_options(self) -> RenderOptions:
-        """Return how the scene is rendered at this point of the run."""
-        return options_at(self.config, self.iteration, self.background, self.texture.sh_degree)
-
-    def save_cameras(self, folder: str | os.PathLike[str]) -> None:
-        """Write the scene's cameras into a folder, so that a model there can be rendered from them."""
-        save_cameras(Path(folder, CAMERAS_FILE), self.scene.cameras)
+        """Return how the scene is rendered at this point: more hits and SH degrees are unlocked on the way."""
+        config = self.config
+        most = max(config.sh_degree, self.texture.sh_degree)
+        return RenderOptions(
+            max_hits=config.hits_at(self.iteration),
+            background=self.background,
+            sh_degree=min(most, self.iteration // config.scaled(config.sh_every)),
+            order=cast(Order, config.order),
+        )
 
     def snapshot(self) -> Snapshot:
         """Return copies on the CPU of everything that shapes the future."""

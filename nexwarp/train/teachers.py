@@ -96,14 +96,15 @@ class TaughtTargets(TargetSource):
             of_photo, camera=camera, photo=picture, exposure=exposure, expected=depths, counts=None, empty=None
         )
 
-    def digest(self) -> str:
-        """Return a digest of the teachers, in their order."""
-        digest = hashlib.sha256()
-        for model in self.teachers:
-            digest.update(str(model.options).encode())
-            for name, value in model.state_dict().items():
-                digest.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+
+def teachers_digest(teachers: Iterable[Model]) -> str:
+    """Return a digest of teachers, in their order."""
+    digest = hashlib.sha256()
+    for model in teachers:
+        digest.update(str(model.options).encode())
+        for name, value in model.state_dict().items():
+            digest.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def check_teachers(teachers: Iterable[Model], scene: Scene, config: Config) -> list[Model]:
@@ -123,15 +124,3 @@ def check_teachers(teachers: Iterable[Model], scene: Scene, config: Config) -> l
             raise TypeError(f"teachers[{number}]: expected a nexwarp.Model, got {type(model).__name__}")
         check_scale(f"teachers[{number}]", model, scene)
     return models
-
-
-def make_targets(
-    state: TrainingState,
-    calibration: ExposureCalibration | None,
-    teachers: Sequence[Model],
-    repeatable: Callable[[Callable[[], Target]], Target],
-) -> TargetSource:
-    """Return what the steps of a training compare with: photos, and renderings of teachers where there are any."""
-    if not teachers:
-        return TargetSource(state, calibration)
-    return TaughtTargets(state, calibration, teachers, repeatable)

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from typing_extensions import Unpack
 
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene
 from nexwarp.errors import DivergedError, OutOfMemoryError, SceneError
 from nexwarp.machine import deterministic, needed_memory, seed_everything, torch_threads
@@ -22,10 +23,10 @@ from nexwarp.train.initial import Start, check_start
 from nexwarp.train.losses import OwnLoss, as_taken, check_own_losses, step_losses
 from nexwarp.train.optimizer import OptimizerMaker, set_rates
 from nexwarp.train.recipe import Config
-from nexwarp.train.report import StepReport, check_health, oom_message, watched_tensors
+from nexwarp.train.report import StepReport, check_health, oom_message
 from nexwarp.train.state import TrainingState, check_origin, check_snapshot, checkpoint_errors, scene_digest
-from nexwarp.train.target import Target, refined
-from nexwarp.train.teachers import check_teachers, make_targets
+from nexwarp.train.target import Target, TargetSource, refined
+from nexwarp.train.teachers import TaughtTargets, check_teachers, teachers_digest
 
 CHECK_EVERY = 100  # iterations between checks that all numbers are finite
 SNAPSHOTS = 10  # that a run takes, one replacing the other
@@ -81,7 +82,11 @@ class Trainer(TrainingState):
         self.exposures = None if calibration is None else calibration.exposures
         capture = config.cuda_graphs and device.type == "cuda" and can_capture(self.optimizer)
         self.graphs = StepGraphs(device) if capture else None
-        self.targets = make_targets(self, calibration, models, partial(beside, self.graphs))
+        self.targets = (
+            TaughtTargets(self, calibration, models, partial(beside, self.graphs))
+            if models
+            else TargetSource(self, calibration)
+        )
         self.views, self.background = self.targets.views, self.targets.background
         self.views_a_step = 1
         self.noted: list[tuple[int, str, torch.Tensor]] = []  # losses since the last check
@@ -236,14 +241,22 @@ class Trainer(TrainingState):
         check_health(self.iteration, noted, self._watched())
 
     def _watched(self) -> dict[str, torch.Tensor]:
-        return watched_tensors(self._named_parameters(), self.optimizer) | {"densify.errors": self.densifier.errors}
+        """Return what must stay finite, by the names that messages give it."""
+        watched = {"densify.errors": self.densifier.errors}
+        for name, parameter in self._named_parameters():
+            # The gradient itself is freed by now; a gradient that is not finite shows in the optimizer's state.
+            for key, value in self.optimizer.state.get(parameter, {}).items():
+                if isinstance(value, torch.Tensor) and value.shape == parameter.shape:
+                    watched[f"{key} of {name}"] = value
+            watched[name] = parameter
+        return watched
 
     def save(self, folder: str | os.PathLike[str]) -> None:
         """Write a checkpoint, the model as it is, and the cameras into a folder, which the commands open."""
         Path(folder).mkdir(parents=True, exist_ok=True)
         self.model().save(folder)  # which refuses a texture that files cannot hold
         self.save_checkpoint(Path(folder))
-        self.save_cameras(folder)
+        save_cameras(Path(folder, CAMERAS_FILE), self.scene.cameras)
 
     def save_checkpoint(self, run: Path) -> None:
         """Write a checkpoint into a folder; DivergedError where something is not finite, OSError on a failing disk."""
@@ -289,4 +302,4 @@ class Trainer(TrainingState):
     def origin(self) -> dict[str, str]:
         """Digests of what a checkpoint must have in common with this run: views, scene and, with any, teachers."""
         origin = {"views": self.views.fingerprint(), "scene": scene_digest(self.scene, self.texture)}
-        return origin | ({"teachers": self.targets.digest()} if self.targets.teachers else {})
+        return origin | ({"teachers": teachers_digest(self.targets.teachers)} if self.targets.teachers else {})

@@ -8,7 +8,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import View
-from nexwarp.train import views as training_views
+from nexwarp.train import target as training_views
 
 K = torch.tensor([[20.0, 0.0, 9.0], [0.0, 21.0, 6.0], [0.0, 0.0, 1.0]])
 

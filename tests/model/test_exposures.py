@@ -30,9 +30,8 @@ from nexwarp.train.exposure import (
 )
 from nexwarp.train.losses import SATURATION, as_taken, photo_losses
 from nexwarp.train.recipe import Config, LossWeights, TextureConfig
-from nexwarp.train.target import Target
+from nexwarp.train.target import Target, mean_color
 from nexwarp.train.trainer import Trainer
-from nexwarp.train.views import mean_color
 from tests.narrowing import present
 from tests.scene_writers import exposure_at, with_exposures, write_demo
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene

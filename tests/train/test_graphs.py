@@ -15,7 +15,7 @@ from nexwarp import ops
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.model import graphs as step_graphs
-from nexwarp.train import views as training_views
+from nexwarp.train import target as training_views
 from nexwarp.train.densify import DensityControl
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.settings import with_settings

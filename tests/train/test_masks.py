@@ -9,8 +9,8 @@ import torch
 from nexwarp.data import Scene, View
 from nexwarp.run.evaluate import Evaluation, evaluate
 from nexwarp.train.recipe import Config, TextureConfig
+from nexwarp.train.target import mean_color
 from nexwarp.train.trainer import Trainer
-from nexwarp.train.views import mean_color
 from tests.tolerances import assert_close
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")

@@ -20,8 +20,8 @@ from nexwarp.train.initial import initial_poses
 from nexwarp.train.optimizer import rate_ends
 from nexwarp.train.recipe import DEMO_SETTINGS, DensifyConfig, LearningRates, preset
 from nexwarp.train.settings import with_settings
+from nexwarp.train.target import with_cameras
 from nexwarp.train.trainer import Trainer
-from nexwarp.train.views import with_cameras
 from tests import scenes
 from tests.cli.support import FLAGS, SMALL
 from tests.tolerances import assert_close

@@ -23,7 +23,7 @@ from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import TextureConfig
 from nexwarp.train.report import StepReport
-from nexwarp.train.stages import OwnTeachers, divide, plan_teachers, stage_runner
+from nexwarp.train.stages import OwnTeachers, StageRunner, divide, plan_teachers
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -380,7 +380,7 @@ def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
     record = RunRecord(source, CONFIG, own=OwnTeachers(2, 4, 240))
     session = Session(run, record, Console(quiet=True), Ranks.alone(CPU))
     session.viewer = Shown()  # type: ignore[assignment]
-    runner = stage_runner(tiny_scene, CONFIG, CPU, session, own=record.own)
+    runner = StageRunner(tiny_scene, CONFIG, CPU, session, own=record.own)
     create_run(run, record)
     runner.train()
     assert steps == [*range(1, 21)] and drawn == [1, 2, 3, 4, 1, 2, 3, 4, *range(1, 13)]
