@@ -161,22 +161,15 @@ def side_by_side(images: Sequence[torch.Tensor], gap: int = 4, captions: Sequenc
 
     `gap` white pixels part neighbours; captions stand on a white band of 16 pixels above the images.
     """
-    panels = [_shown(f"images[{i}]", image) for i, image in enumerate(images)]
-    if captions is not None:
-        panels = [
-            torch.cat([_caption(text, panel.shape[1]), panel]) for text, panel in zip(captions, panels, strict=True)
-        ]
-    white = torch.full((len(panels[0]), gap, 3), 255, dtype=torch.uint8)
-    return torch.cat([part for panel in panels for part in (white, panel)][1:], dim=1)
-
-
-def _caption(text: str, width: int) -> torch.Tensor:
-    """(CAPTION_HEIGHT, width, 3) uint8, black text on white, cropped at the right."""
     from PIL import Image, ImageDraw, ImageFont
 
-    band = Image.new("RGB", (width, CAPTION_HEIGHT), "white")
-    ImageDraw.Draw(band).text((2, 2), text, fill="black", font=ImageFont.load_default())
-    return torch.from_numpy(np.array(band))
+    panels = [_shown(f"images[{i}]", image) for i, image in enumerate(images)]
+    for i, text in enumerate(captions or ()):  # cropped at the right
+        band = Image.new("RGB", (panels[i].shape[1], CAPTION_HEIGHT), "white")
+        ImageDraw.Draw(band).text((2, 2), text, fill="black", font=ImageFont.load_default())
+        panels[i] = torch.cat([torch.from_numpy(np.array(band)), panels[i]])
+    white = torch.full((len(panels[0]), gap, 3), 255, dtype=torch.uint8)
+    return torch.cat([part for panel in panels for part in (white, panel)][1:], dim=1)
 
 
 @lru_cache(maxsize=1)

@@ -128,7 +128,7 @@ class PathEditor:
         start = time.perf_counter()
         try:
             for number, camera in enumerate(self.path(PLAY_FPS) if self.playing else (), 1):
-                self.session.go(camera_to_world(camera), vertical_fov(camera))
+                self.session.go(Viewpoint.of_camera(camera))
                 await asyncio.sleep(max(start + number / PLAY_FPS - time.perf_counter(), 0.0))
                 if self.session.closed.is_set() or not self.playing:
                     break
@@ -247,27 +247,25 @@ class Session:
     def jump(self, name: str) -> None:
         """Go to a camera of the scene; an unknown name is ignored."""
         if name in self.cameras:
-            camera = self.cameras[name]
-            self.go(camera_to_world(camera), vertical_fov(camera))
+            self.go(Viewpoint.of_camera(self.cameras[name]))
 
-    def go(self, pose: np.ndarray, fov: float) -> None:
-        """Move to a (4, 4) camera-to-world pose in the scene's frame, and orbit a point in front of it; fov in rad."""
-        position, forward = self.world.to_browser(pose[:3, 3]), pose[:3, 2]
+    def go(self, view: Viewpoint) -> None:
+        """Move to a view, and orbit a point in front of it."""
+        position, forward = self.world.to_browser(view.pose[:3, 3]), view.pose[:3, 2]
         distance = max(float((self.world.to_browser(self.world.focus) - position) @ forward), 0.5)
         camera = self.client.camera
         with suppress(TypeError, ValueError):  # the browser had sent an invalid camera
             with self.client.atomic():
                 camera.position = position
-                camera.wxyz = np.array(_wxyz(pose))
+                camera.wxyz = np.array(_wxyz(view.pose))
                 camera.look_at = position + forward * distance
-                camera.fov = fov
-            set_changed(self.fov, "value", float(round(float(np.rad2deg(fov)))))
+                camera.fov = view.fov
+            set_changed(self.fov, "value", float(round(float(np.rad2deg(view.fov)))))
 
     # Frustums
 
     def _add_frustums(self) -> None:
-        names = list(self.cameras)
-        chosen = names[:: -(-len(names) // MOST_FRUSTUMS) or 1]
+        chosen = list(self.cameras)[:: -(-len(self.cameras) // MOST_FRUSTUMS) or 1]
         poses = np.array([camera_to_world(self.cameras[name]) for name in chosen]).reshape(-1, 4, 4)
         self.places = self.world.to_browser(poses[:, :3, 3])
         self.frustum_size = frustum_size(self.places)
@@ -346,8 +344,8 @@ class Session:
     def _cameras(self) -> None:
         from viser import Icon
 
-        gui, home = self.client.gui, self.home
-        on_click(gui.add_button("Back to the start", icon=Icon.HOME), lambda: self.go(home.pose, home.fov))
+        gui = self.client.gui
+        on_click(gui.add_button("Back to the start", icon=Icon.HOME), lambda: self.go(self.home))
         if not self.cameras:
             gui.add_markdown("This run has no cameras.")
             return

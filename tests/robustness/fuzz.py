@@ -31,7 +31,7 @@ import warp as wp
 
 from nexwarp.kernels import launch
 from tests.robustness.fuzz_inputs import Files, damage
-from tests.robustness.fuzz_targets import TARGETS, FuzzTarget
+from tests.robustness.fuzz_targets import TARGETS, FuzzTarget, write_input
 
 HANG = 5.0  # seconds an input may use the processor
 ASLEEP = 6  # how many times as long it may take where it does not use it: on a busy machine, or asleep
@@ -144,7 +144,7 @@ class Campaign:
         _confine()
         for index in indices:
             rng = random.Random(f"{self.seed}/{self.target.name}/{index}")
-            self.target.write(folder, damage(rng, rng.choice(valid), self.target.fuzzed))
+            write_input(folder, damage(rng, rng.choice(valid), self.target.fuzzed))
             # Unless the input ends in time, a signal ends the process.
             signal.setitimer(signal.ITIMER_PROF, HANG)
             signal.setitimer(signal.ITIMER_REAL, ASLEEP * HANG)

@@ -62,16 +62,13 @@ class FuzzTarget:
     read: Callable[[Path], object]
     fuzzed: tuple[str, ...]
 
-    def write(self, folder: Path, files: Files) -> None:
-        """Put an input into a folder, in place of the one before it."""
-        there = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
-        for name in there:
-            if name.endswith(self.fuzzed) and name not in files:
-                (folder / name).unlink()
-        for name, data in files.items():
-            if name.endswith(self.fuzzed) or name not in there:
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                (folder / name).write_bytes(data)
+
+def write_input(folder: Path, files: Files) -> None:
+    """Put an input into a folder, in place of the one before it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    for name, data in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
 
 
 def _files(folder: Path) -> Files:

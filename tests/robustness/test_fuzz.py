@@ -12,7 +12,7 @@ import pytest
 
 from tests.robustness.fuzz import Campaign
 from tests.robustness.fuzz_inputs import damage
-from tests.robustness.fuzz_targets import TARGETS, FuzzTarget
+from tests.robustness.fuzz_targets import TARGETS, FuzzTarget, write_input
 
 ROOT = Path(__file__).parents[2]
 INPUTS = 80
@@ -43,7 +43,7 @@ def test_readers_load_or_refuse_in_one_line(tmp_path: Path, long: bool) -> None:
 def test_the_valid_files_load(tmp_path: Path, name: str) -> None:
     target = TARGETS[name]
     for index, files in enumerate(target.make(tmp_path / "valid")):
-        target.write(tmp_path / str(index), files)
+        write_input(tmp_path / str(index), files)
         target.read(tmp_path / str(index))
 
 

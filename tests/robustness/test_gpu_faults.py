@@ -1,18 +1,16 @@
-"""Faults of a GPU: too little memory, a fault that ends the context, NaN out of a kernel. On a CPU they are played."""
+"""Faults of a GPU: too little memory, or a fault that ends the context. On a CPU they are played."""
 
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import ops
 from nexwarp.cli import main as cli
-from nexwarp.errors import DivergedError, OutOfMemoryError
+from nexwarp.errors import OutOfMemoryError
 from nexwarp.machine import deterministic
 from nexwarp.model.buffers import PASSES, render_buffers
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
@@ -190,42 +188,3 @@ def test_a_fault_of_the_gpu_stops_training_and_the_last_checkpoint_is_resumed(ti
             assert (run / "model.safetensors").read_bytes() == expected, fatal
         assert train(tiny_folder, run, device, "--resume") == 0
         assert (run / "model.safetensors").read_bytes() == expected, fatal
-
-
-# NaN out of a kernel
-
-
-def poisoned(trainer: Trainer, iterations: range, monkeypatch: pytest.MonkeyPatch, *, once: bool) -> list[int]:
-    """Let the composition return a NaN in some iterations; list them."""
-    original: Callable[..., tuple[torch.Tensor, torch.Tensor]] = ops.compose
-    found: list[int] = []
-
-    def compose(*arguments: Any) -> tuple[torch.Tensor, torch.Tensor]:
-        image, textured = original(*arguments)
-        if trainer.iteration in iterations and not (once and found):
-            found.append(trainer.iteration)
-            bad = torch.ones_like(image)
-            bad[3, 5] = float("nan")
-            image = image * bad
-        return image, textured
-
-    monkeypatch.setattr(ops, "compose", compose)
-    return found
-
-
-@pytest.mark.parametrize("once", [True, False])
-def test_a_nan_of_a_kernel_takes_training_back_once(tiny_scene, monkeypatch, device, once):
-    """Where it comes again, training ends in its last good state."""
-    trainer = Trainer(tiny_scene, small(cuda_graphs=False, iterations=60), device)
-    found = poisoned(trainer, range(22, 100), monkeypatch, once=once)
-    warnings: list[str] = []
-    if once:
-        trainer.run(warn=warnings.append, until=30)
-        assert found == [22] and trainer.iteration == 30 and trainer.rate_factor == 0.5
-    else:
-        with pytest.raises(DivergedError, match=r"^iteration 22: the loss '\w+' is nan.* training gives up$"):
-            trainer.run(warn=warnings.append)
-        assert trainer.iteration == 18
-    (line,) = warnings
-    assert "going back to iteration 18 with half the learning rates" in line
-    trainer.check()
