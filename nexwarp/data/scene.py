@@ -306,13 +306,12 @@ def _check_types(source: SceneSource) -> None:
         "format": ((str, nothing), "text"),
         "follow_links": ((bool,), "True or False"),
         "skip_missing": ((bool,), "True or False"),
+        "downscale": ((int,), "an int"),
     }
     for name, (kind, expected) in kinds.items():
         value = getattr(source, name)
-        if not isinstance(value, kind):
+        if not isinstance(value, kind) or (isinstance(value, bool) and bool not in kind):
             raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}")
-    if isinstance(source.downscale, bool) or not isinstance(source.downscale, int):
-        raise TypeError(f"downscale: expected an int, got {type(source.downscale).__name__}")
 
 
 def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | None) -> Scene:

@@ -13,9 +13,9 @@ from tyro.conf import arg
 from nexwarp.cameras.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
-from nexwarp.data.frame_camera import lens_keys
 from nexwarp.data.images import image_size
 from nexwarp.data.scene import DEMO, SceneSource, demo_folder
+from nexwarp.data.transforms import lens_keys
 from nexwarp.errors import RunError, SettingError
 from nexwarp.export.bake import bake
 from nexwarp.export.glb import save_glb

@@ -4,9 +4,7 @@ import pytest
 import torch
 
 from nexwarp.data import Scene, demo_folder, load_scene
-from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.scene import SceneSource
-from tests.scene_writers import write_demo
 
 
 @pytest.fixture(scope="module")
@@ -48,11 +46,3 @@ def test_points_reproject_onto_their_colors(scene: Scene) -> None:
 def test_tracks_and_errors_are_those_of_structure_from_motion(scene: Scene) -> None:
     tracks, errors = scene.track_lengths, scene.reprojection_errors
     assert tracks.min() == 2 and 0.002 < (tracks == 2).double().mean() < 0.03 and errors.median() < 1.5
-
-
-def test_smaller_copies_agree(tmp_path, scene: Scene) -> None:
-    copy = load_scene(write_demo(tmp_path / "copy", width=48, height=36, views=10, points=100))
-    assert len(copy.train) + len(copy.test) == 10 and len(copy.points) == 100
-    assert copy.test[0].camera.fx == pytest.approx(scene.test[0].camera.fx / 2)
-    torch.testing.assert_close(copy.test[0].camera.viewmat, scene.test[0].camera.viewmat)
-    assert pycolmap_module().Reconstruction(str(tmp_path / "copy" / "sparse" / "0")).num_points3D() == 100

@@ -90,6 +90,7 @@ def test_a_signalling_nan_is_refused_without_a_warning(tmp_path):
         read_ply(tmp_path / "a.ply")
 
 
+FACES = "element face 1\nproperty list uchar int i\n"
 ONE = struct.pack("<3f", 1, 2, 3)
 BAD = {
     "empty": (b"", "does not begin with 'ply'"),
@@ -109,24 +110,15 @@ BAD = {
     "more than there is": (ply(vertex(10**17, *XYZ), ONE), "truncated, expected 100,000,000,000,000,000 of element"),
     "ascii beyond the end": (ply(vertex(10**17, *XYZ), b"1 2 3\n", "ascii"), "truncated, expected 100,000,000,000,000"),
     "ascii too short": (
-        ply(vertex(3, *XYZ), b"1 2 3\n1.2345678 2 3\n1.2345 2\n", "ascii"),
+        ply(vertex(3, *XYZ), b"1 2 3\n1.23456 2 3\n1.2345 2\n", "ascii"),
         "expected rows of 3 numbers",
     ),
     "ascii of words": (ply(vertex(1, *XYZ), b"one two three\n", "ascii"), "expected rows of 3 numbers"),
     "ascii of four": (ply(vertex(1, *XYZ), b"1 2 3 4\n", "ascii"), r"got \(1, 4\)"),
     "ascii of bytes": (ply(vertex(1, *XYZ), b"1 2 \xff\xfe\n", "ascii"), "expected rows of 3 numbers"),
-    "lists": (
-        ply("element vertex 1\nproperty list uchar float x\n", ONE),
-        "vertices without lists first, got its lists",
-    ),
-    "lists before": (
-        ply("element face 1\nproperty list uchar int i\n" + vertex(1, *XYZ), ONE),
-        "vertices without lists first, got lists of face",
-    ),
-    "NaN": (
-        ply(vertex(1, *XYZ), struct.pack("<3f", 1, np.nan, 3)),
-        r"finite points, got \(1.0, nan, 3.0\) \(vertex 0\)",
-    ),
+    "lists": (ply("element vertex 1\nproperty list uchar float x\n", ONE), "without lists first, got its lists"),
+    "lists before": (ply(FACES + vertex(1, *XYZ), ONE), "vertices without lists first, got lists of face"),
+    "NaN": (ply(vertex(1, *XYZ), struct.pack("<3f", 1, np.nan, 3)), r"finite points, got \(1.0, nan, 3.0\) \(vertex 0"),
 }
 
 

@@ -210,11 +210,8 @@ def _in_child(order: Order, scene: Path, observe: Observer) -> SfmReport:
     if "error" in answer:
         kind, text, number = answer["error"], answer["text"], answer["number"]
     else:
-        kind, text, number = (
-            "SceneError",
-            _end_of(order.source, child.returncode, b"".join(last).decode(errors="replace")),
-            None,
-        )
+        kind, number = "SceneError", None
+        text = _end_of(order.source, child.returncode, b"".join(last).decode(errors="replace"))
     if PYCOLMAP in text:  # it seldom tells why
         number = errno.ENOSPC if FULL.search(text) else _write_fault(Path(order.folder))
     if number in FULL_ERRORS:

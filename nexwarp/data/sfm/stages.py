@@ -144,11 +144,7 @@ class Stages:
             run_stage(
                 "features",
                 lambda: pycolmap.extract_features(
-                    self.database,
-                    self.photos,
-                    list(names),
-                    extraction_options=extraction,
-                    device=pycolmap.Device.cpu,
+                    self.database, self.photos, list(names), extraction_options=extraction, device=pycolmap.Device.cpu
                 ),
                 lambda: done(count()),
             )
@@ -245,11 +241,7 @@ class Stages:
         run_stage(
             "undistorting",
             lambda: pycolmap.undistort_images(
-                output,
-                chosen,
-                self.photos,
-                jpeg_quality=JPEG_QUALITY,
-                num_threads=self.decoders,
+                output, chosen, self.photos, jpeg_quality=JPEG_QUALITY, num_threads=self.decoders
             ),
             lambda: done(sum(len(files) for _, _, files in os.walk(output / "images"))),
         )

@@ -74,11 +74,16 @@ def save_png(file: Path, photo: np.ndarray) -> None:
     Image.fromarray(photo).save(file)
 
 
-def write_photos(folder: Path, save: Callable[[Path, np.ndarray], None] = save_png, suffix: str = "png") -> list[str]:
+def write_photos(
+    folder: Path,
+    save: Callable[[Path, np.ndarray], None] = save_png,
+    suffix: str = "png",
+    rays: np.ndarray | None = None,
+) -> list[str]:
     """Write the photos of all poses into a folder and return their names."""
     folder.mkdir(parents=True)
     names = [f"{index}.{suffix}" for index in range(VIEWS)]
-    for name, photo in zip(names, photos(), strict=True):
+    for name, photo in zip(names, photos(rays=rays), strict=True):
         save(folder / name, photo)
     return names
 

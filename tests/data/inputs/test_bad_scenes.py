@@ -40,7 +40,12 @@ def header_only(width: int, height: int) -> bytes:
     return start + b"\0\0\0\0IDAT" + struct.pack(">I", zlib.crc32(b"IDAT"))
 
 
+def keys(**changes):
+    return spoilt(lambda data: data.update(changes))
+
+
 ROWS = np.eye(4).tolist()
+DOUBLE = (2 * np.eye(4)).tolist()
 SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
 BAD = {
     "no JSON": (text("{frames: []"), r"transforms.json: expected JSON, could not parse it"),
@@ -53,10 +58,7 @@ BAD = {
     "empty frames": (spoilt(lambda data: data["frames"].clear()), r"frames: expected a list .*, got \[\]"),
     "frame that is none": (spoilt(lambda data: data["frames"].append(7)), "frame 10: expected a JSON object, got 7"),
     "one frame": (spoilt(lambda data: data.update(frames=data["frames"][:1])), "at least 2 registered images"),
-    "frame twice": (
-        spoilt(lambda data: data["frames"].append(data["frames"][2])),
-        "each photo once, got view_00.* twice",
-    ),
+    "frame twice": (spoilt(lambda d: d["frames"].append(d["frames"][2])), "each photo once, got view_00.* twice"),
     "no file name": (frame(file_path=None), "frame 3: file_path: expected the name of a file, got None"),
     "no such file": (frame(file_path="images/x.png"), "1 of .* photos: image not found: images/x.png; --skip-missing"),
     "parent": (frame(file_path="images/../../x.png"), "file_path: .* leaves the scene's folder"),
@@ -64,33 +66,18 @@ BAD = {
     "drive": (frame(file_path="C:\\x.png"), "file_path: .* leaves the scene's folder"),
     "backslashes": (frame(file_path="images\\..\\..\\x.png"), "leaves the scene's folder"),
     "zero byte": (frame(file_path="images/\0.png"), "leaves the scene's folder"),
-    "no matrix": (
-        frame(transform_matrix=None),
-        "frame 3 .*: transform_matrix: expected a 4x4 matrix .*, got None",
-    ),
+    "no matrix": (frame(transform_matrix=None), "frame 3 .*: transform_matrix: expected a 4x4 matrix .*, got None"),
     "short matrix": (frame(transform_matrix=ROWS[:2]), "expected a 4x4 matrix of numbers"),
     "ragged matrix": (frame(transform_matrix=[[1, 2], *ROWS[1:]]), "expected a 4x4 matrix of numbers"),
     "text matrix": (frame(transform_matrix=[["1", 0, 0, 0], *ROWS[1:]]), "expected a 4x4 matrix of numbers"),
     "infinite matrix": (frame(transform_matrix=[[1e999, 0, 0, 0], *ROWS[1:]]), "Infinity is no JSON|expected finite"),
     "large whole number": (frame(transform_matrix=[[10**400, 0, 0, 0], *ROWS[1:]]), "expected a 4x4 matrix"),
     "singular matrix": (frame(transform_matrix=SINGULAR), "expected an invertible pose, got the singular"),
-    "scaled matrix": (
-        frame(transform_matrix=(2 * np.eye(4)).tolist()),
-        "last row 0, 0, 0, 1|singular, sheared, scaled",
-    ),
+    "scaled matrix": (frame(transform_matrix=DOUBLE), "last row 0, 0, 0, 1|singular, sheared, scaled"),
     "projective matrix": (frame(transform_matrix=[*ROWS[:3], [0, 0, 1, 1]]), "the last row 0, 0, 0, 1"),
-    "singular applied": (
-        spoilt(lambda d: d.update(applied_transform=SINGULAR)),
-        "applied_transform: .* got the singular",
-    ),
-    "applied scale of 0": (
-        spoilt(lambda data: data.update(applied_scale=0)),
-        "applied_scale: expected a number above 0",
-    ),
-    "endless applied scale": (
-        spoilt(lambda data: data.update(applied_scale=1e200)),
-        "applied_scale: expected a number above 0, got 1e[+]200",
-    ),
+    "singular applied": (keys(applied_transform=SINGULAR), "applied_transform: .* got the singular"),
+    "applied scale of 0": (keys(applied_scale=0), "applied_scale: expected a number above 0"),
+    "endless applied scale": (keys(applied_scale=1e200), "applied_scale: expected a number above 0, got 1e[+]200"),
     "focal length of 0": (spoilt(lambda data: data.update(fl_x=0.0)), "K: expected focal lengths > 0, got 0"),
     "no focal length": (spoilt(lambda d: [d.pop(k) for k in ("fl_x", "fl_y")] and None), "expected a focal length"),
     "angle of pi": (
@@ -100,10 +87,7 @@ BAD = {
     "text focal length": (spoilt(lambda data: data.update(fl_x="wide")), "fl_x: expected a number, got 'wide'"),
     "half a pixel": (spoilt(lambda data: data.update(w=96.5)), "w, h: expected whole numbers of pixels"),
     "billions of pixels": (spoilt(lambda data: data.update(w=10**9)), "expected an image size of 1 to 65536"),
-    "unknown camera model": (
-        spoilt(lambda d: d.update(camera_model="FISHEYE624")),
-        "camera_model: .* got 'FISHEYE624'",
-    ),
+    "unknown camera model": (keys(camera_model="FISHEYE624"), "camera_model: .* got 'FISHEYE624'"),
     "model of a list": (spoilt(lambda data: data.update(camera_model=[1])), r"camera_model: .* got \[1\]"),
     "unknown coefficient": (spoilt(lambda data: data.update(p3=0.1)), "p3: expected no such key of a OPENCV camera"),
     "photos of another shape": (spoilt(lambda data: data.update(w=50, h=72)), "expected an image of 50x72 pixels"),
@@ -120,7 +104,7 @@ BAD = {
     "black mask": (mask_of(96, 72, 0), "view_003.png: expected a mask with pixels that count, got none"),
     "bomb": (
         file("images/view_003.png", header_only(60_000, 60_000)),
-        "view_003.png: expected .* megapixels, got more",
+        "view_003.png: expected .* megapixels, got",
     ),
     "cut-off photo": (file("images/view_003.png", header_only(96, 72)), "view_003.png: expected a complete image file"),
     "mask bomb": (file("q.png", header_only(60_000, 60_000), mask_path="q.png"), "q.png: expected .* megapixels"),
@@ -176,7 +160,6 @@ def test_a_photo_may_not_be_in_both_of_blenders_files(demo, tmp_path):
         ({"background": 0.5}, ValueError, "background: expected white, black, random or three numbers"),
         ({"points": "absent.ply"}, FileNotFoundError, "absent.ply: no such file"),
         ({"points": 3}, TypeError, "points: expected the path of a PLY file, got int"),
-        ({"images": "images_9"}, FileNotFoundError, "images: no folder 'images_9'"),
     ],
 )
 def test_bad_arguments(demo, options, error, message):

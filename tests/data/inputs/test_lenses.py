@@ -72,58 +72,35 @@ def rays_through(bend, focal: float = FOCAL) -> np.ndarray:
 # camera_model and coefficients in transforms.json; the closed form; a COLMAP camera of the same
 BARREL_K = {"k1": -0.18, "k2": 0.08}
 BROWN = {**BARREL_K, "k3": 0.02, "k4": 0.15, "p1": 0.01}
-TURNED = (0.01, -0.006)
+BENT, TURNED = (-0.18, 0.08), (0.01, -0.006)
+RATIONAL = {"camera_model": "FULL_OPENCV", **BARREL_K, "k4": 0.15}
+FISH = {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k4": -0.01}
 LENSES: dict[str, Any] = {
-    "OPENCV": (
-        {**BARREL_K, "p1": 0.01, "p2": -0.006},
-        radial((), (-0.18, 0.08), (), TURNED),
-        "OPENCV -0.18 0.08 0.01 -0.006",
-    ),
+    "OPENCV": ({**BARREL_K, "p1": 0.01, "p2": -0.006}, radial((), BENT, (), TURNED), "OPENCV -0.18 0.08 0.01 -0.006"),
     "no model named": ({"camera_model": None, **BARREL_K}, radial((), (-0.18, 0.08)), "RADIAL -0.18 0.08"),
     "k3": ({**BARREL_K, "k3": 0.1}, radial((), (-0.18, 0.08, 0.1)), None),
     "Brown's k4": (BROWN, radial((), (-0.18, 0.08, 0.02, 0.15), (), (0.01, 0.0)), None),
     "a list": ({"distortion_params": [-0.18, 0.08, 0.02, 0.15]}, radial((), (-0.18, 0.08, 0.02, 0.15)), None),
-    "rational": (
-        {"camera_model": "FULL_OPENCV", **BARREL_K, "k4": 0.15},
-        radial((), (-0.18, 0.08), (0.15,)),
-        "FULL_OPENCV -0.18 0.08 0 0 0 0.15 0 0",
-    ),
-    "k5": (
-        {**BARREL_K, "k4": 0.15, "k5": 0.05},
-        radial((), (-0.18, 0.08), (0.15, 0.05)),
-        "FULL_OPENCV -0.18 0.08 0 0 0 0.15 0.05 0",
-    ),
-    "fisheye": (
-        {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k4": -0.01},
-        radial((0.05, 0.0, 0.0, -0.01)),
-        "OPENCV_FISHEYE 0.05 0 0 -0.01",
-    ),
-    "older words": (
-        {"camera_model": None, "is_fisheye": True, "k1": 0.05},
-        radial((0.05,)),
-        "RADIAL_FISHEYE 0.05 0",
-    ),
+    "rational": (RATIONAL, radial((), BENT, (0.15,)), "FULL_OPENCV -0.18 0.08 0 0 0 0.15 0 0"),
+    "k5": ({**BARREL_K, "k4": 0.15, "k5": 0.05}, radial((), BENT, (0.15, 0.05)), None),
+    "fisheye": (FISH, radial((0.05, 0.0, 0.0, -0.01)), "OPENCV_FISHEYE 0.05 0 0 -0.01"),
+    "older words": ({"camera_model": None, "is_fisheye": True, "k1": 0.05}, radial((0.05,)), "RADIAL_FISHEYE 0.05 0"),
 }
 
 
 @pytest.mark.parametrize("kind", LENSES)
 def test_photos_of_a_lens_show_the_room(tmp_path, kind):
     keys, bend, colmap = LENSES[kind]
-    photos = room.photos(rays=rays_through(bend))
-    for path in (tmp_path / "nerfstudio", tmp_path / "colmap"):
-        (path / "images").mkdir(parents=True)
-        for index, photo in enumerate(photos):
-            room.save_png(path / f"images/{index}.png", photo)
-    names = [f"images/{index}.png" for index in range(room.VIEWS)]
+    names = room.write_photos(tmp_path / "images", rays=rays_through(bend))
     lens = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": CENTRE[0], "cy": CENTRE[1], "camera_model": "OPENCV"}
-    scene = load_scene(room.write_transforms(tmp_path / "nerfstudio", room.transforms(names, **lens | keys)))
-    assert room.color_error(scene) < room.RIGHT
+    data = room.transforms([f"images/{name}" for name in names], **lens | keys)
+    assert room.color_error(load_scene(room.write_transforms(tmp_path, data))) < room.RIGHT
     if colmap is not None:
         model, *coefficients = colmap.split()
         focal = [FOCAL] if "RADIAL" in model else [FOCAL, FOCAL]
         camera = " ".join(map(str, [model, room.WIDTH, room.HEIGHT, *focal, *CENTRE, *coefficients]))
-        same = load_scene(room.write_colmap(tmp_path / "colmap", [name[7:] for name in names], camera))
-        assert room.color_error(same) < room.RIGHT
+        room.write_colmap(tmp_path, names, camera)
+        assert room.color_error(load_scene(tmp_path, format="colmap")) < room.RIGHT
 
 
 @pytest.mark.parametrize("degrees", [120, 170, 190, 240])
@@ -133,10 +110,7 @@ def test_a_wide_fisheye_keeps_its_view(tmp_path, degrees):
     flat = room.pinhole_rays((focal, focal, *CENTRE))[..., :2]
     angle = np.linalg.norm(flat, axis=-1, keepdims=True)
     rays = np.concatenate([flat / angle * np.sin(angle), np.cos(angle)], axis=-1)
-    (tmp_path / "images").mkdir()
-    for index, photo in enumerate(room.photos(rays=rays)):
-        room.save_png(tmp_path / f"images/{index}.png", photo)
-    names = [f"images/{index}.png" for index in range(room.VIEWS)]
+    names = [f"images/{name}" for name in room.write_photos(tmp_path / "images", rays=rays)]
     lens = {"fl_x": focal, "fl_y": focal, "cx": CENTRE[0], "cy": CENTRE[1], "camera_model": "OPENCV_FISHEYE"}
     scene = load_scene(room.write_transforms(tmp_path, room.transforms(names, **lens)))
     camera = scene.train[0].camera

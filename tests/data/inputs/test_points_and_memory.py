@@ -1,6 +1,5 @@
-"""Points of one's own, memory, and progress."""
+"""Many points, memory, and progress."""
 
-import numpy as np
 import pytest
 import torch
 
@@ -9,26 +8,6 @@ import nexwarp.data.views
 import nexwarp.machine
 from nexwarp.data import load_scene
 from tests.data.test_scene import make_scene
-from tests.scene_writers import write_points
-
-# Points of one's own
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
-def test_points_of_a_ply_file(tmp_path, form):
-    path = make_scene(tmp_path / "scene")
-    rng = np.random.default_rng(0)
-    points, colors = rng.normal(size=(30, 3)), rng.integers(0, 256, (30, 3))
-    scene = load_scene(path, points=write_points(tmp_path / "mine.ply", points, colors, form))
-    assert np.array_equal(scene.points.numpy(), points.astype(np.float32))
-    assert np.array_equal(scene.colors.numpy(), colors)
-    assert scene.scale == pytest.approx(load_scene(path).scale)
-
-
-def test_points_of_one_s_own_make_up_for_none(tmp_path):
-    path = make_scene(tmp_path / "scene", points=np.zeros((0, 3)))
-    scene = load_scene(path, points=write_points(tmp_path / "mine.ply", np.eye(3), np.eye(3)))
-    assert torch.equal(scene.points, torch.eye(3))
 
 
 def test_huge_clouds_are_thinned(tmp_path, monkeypatch):
@@ -37,9 +16,6 @@ def test_huge_clouds_are_thinned(tmp_path, monkeypatch):
     scene, again = load_scene(path), load_scene(path)
     assert len(scene.points) == len(scene.colors) == len(scene.track_lengths) == 10
     assert torch.equal(scene.points, again.points)
-
-
-# Memory, progress, formats
 
 
 def test_photos_that_do_not_fit_are_refused_before_they_are_read(tmp_path, monkeypatch):
