@@ -65,13 +65,18 @@ def test_a_rendering_or_gradient_that_lacks_memory_can_be_repeated(device):
     with failing_gpu() as counted:
         results()
     assert len(counted.requests) > 20
-    for fatal in chosen(len(counted.requests), device):
-        with (
-            pytest.raises((OutOfMemoryError, torch.OutOfMemoryError), match=r"2\.00 GiB"),
-            failing_gpu(fatal),
-        ):
-            results()
+    failed, all_fatal = 0, chosen(len(counted.requests), device)
+    for fatal in all_fatal:
+        try:
+            with failing_gpu(fatal) as asked:
+                results()
+        except (OutOfMemoryError, torch.OutOfMemoryError) as error:
+            assert "2.00 GiB" in str(error)
+            failed += 1
+        else:
+            assert len(asked.requests) <= fatal  # frames that are no longer captured ask for less
         assert all(torch.equal(a, b) for a, b in zip(results(), expected, strict=True)), fatal
+    assert failed > 0.8 * len(all_fatal)
 
 
 # Memory, training
