@@ -43,10 +43,7 @@ LARGEST_OUTPUT = 1e12  # of a layer of the texture's MLP
 
 
 def check_bounds(tensors: Mapping[str, torch.Tensor]) -> None:
-    """Raise ValueError that names the tensor, the value and its range, if a model with these tensors could not render.
-
-    The tensors are by their names in a model file, with the shapes of the format; other names are passed over.
-    """
+    """Raise ValueError that names the tensor, by its name in a model file, if a model with it could not render."""
     tensors = {name: x.float() if x.dtype == torch.float16 else x for name, x in tensors.items()}
     for name, tensor in tensors.items():
         bounds = MATRIX_BOUNDS if name.startswith(MATRICES) else BOUNDS.get(name)

@@ -166,10 +166,7 @@ def matern_kernel(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
 
 
 def fit_process(kernel: torch.Tensor, values: torch.Tensor, noise: float) -> tuple[float, torch.Tensor, torch.Tensor]:
-    """Fit a process with a kernel matrix (V, V) to values (V, 3).
-
-    Return the sum of the squared errors of predicting each value from the others, coefficients (V, 3) and mean (3,).
-    """
+    """Return the sum of the squared errors of predicting each value (V, 3) from the others, coefficients and mean."""
     inverse = torch.linalg.inv(kernel + noise * torch.eye(len(values), dtype=values.dtype))
     mean = inverse.sum(0) @ values / inverse.sum()
     coefficients = inverse @ (values - mean)

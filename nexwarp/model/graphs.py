@@ -139,10 +139,7 @@ def _tensors_of(module: nn.Module) -> list[torch.Tensor]:
 
 
 def render(frame: Frame, *, whole: bool = True) -> Rendering:
-    """Render by a graph where there can be one; not `whole` keeps the image alone, which takes less memory.
-
-    Else render kernel by kernel; where memory does not suffice, again without any graphs.
-    """
+    """Render by a graph where there can be one; not `whole` keeps the image alone, which takes less memory."""
     device = frame.surfels.device
     if (graphs := _graphs_for(frame)) is not None and (rendering := graphs.render(frame, whole)) is not None:
         return rendering
@@ -393,25 +390,23 @@ def _graphs_for(frame: Frame) -> FrameGraphs | None:
 
 def _can_capture(device: torch.device, frame: Frame) -> bool:
     """Whether a frame fits the tensors that a graph reads, needs no gradients and is none of a larger graph."""
-    camera, background = frame.camera, frame.background
-    if not isinstance(camera, Camera) or isinstance(camera, StagedCamera):
+    camera, read = frame.camera, [*frame.tensors]
+    if isinstance(frame.background, torch.Tensor):
+        if frame.background.dtype != torch.float32 or frame.background.shape not in ((), (3,)):
+            return False
+        read.append(frame.background)
+    if isinstance(camera, StagedCamera) or camera.device not in (device, torch.device("cpu")):
         return False
     if frame.texture is not None and type(frame.texture) is not NeuralTexture:  # it may depend on anything
         return False
     if camera.width * camera.height * max(frame.options.max_hits, 1) > MOST_POINTS:
         return False
-    if camera.viewmat.dtype != torch.float32 or camera.device not in (device, torch.device("cpu")):
+    if any(x.device != device for x in read):
         return False
-    if any(x.device != device or (x.is_floating_point() and x.dtype != torch.float32) for x in frame.tensors):
+    read.append(camera.viewmat)
+    if any(x.is_floating_point() and x.dtype != torch.float32 for x in read):
         return False
-    differentiated = [*frame.tensors, camera.viewmat]
-    if isinstance(background, torch.Tensor):
-        if (background.dtype, background.device) != (torch.float32, device) or background.shape not in ((), (3,)):
-            return False
-        differentiated.append(background)
-    if torch.is_grad_enabled() and any(x.requires_grad for x in differentiated):
-        return False
-    return not capturing(device)
+    return not (capturing(device) or (torch.is_grad_enabled() and any(x.requires_grad for x in read)))
 
 
 # Training steps

@@ -159,8 +159,8 @@ def load(path: str | os.PathLike[str]) -> Model:
         with safe_open(path, "pt") as file:
             meta = _read_metadata(path, (file.metadata() or {}).get("nexwarp"))
             compact = meta["format_version"] == COMPACT_VERSION
-            options, shape = _read_options(meta), _read_texture_shape(meta)
-            texture = _empty_texture(shape)
+            options = _read_options(meta)
+            texture = _empty_texture(meta)
             texture_shapes = {name: list(x.shape) for name, x in _stored_state(texture).items()}
             # Tensors that this version does not know are passed over.
             known = FIXED_NAMES | texture_shapes.keys() | (CODE_NAMES if compact else set())
@@ -213,8 +213,8 @@ def _read_options(meta: dict[str, Json]) -> RenderOptions:
     return RenderOptions(**values)  # type: ignore[arg-type]  # the constructor checks the types
 
 
-def _read_texture_shape(meta: dict[str, Json]) -> dict[str, Json] | None:
-    """Remove the arguments of the texture from the metadata and return them; the constructor checks their values."""
+def _empty_texture(meta: dict[str, Json]) -> Texture | None:
+    """Make the texture whose record is taken out of the metadata; allocate nothing, even for huge sizes."""
     shape = meta.pop("texture")
     if shape is None:
         return None
@@ -223,18 +223,10 @@ def _read_texture_shape(meta: dict[str, Json]) -> dict[str, Json] | None:
     if "parts" in shape:
         raise ValueError("texture: expected one texture: models merged from blocks were removed after 7f7bd6c")
     if KIND in shape:
-        return shape
-    return {name: x for name, x in shape.items() if name in TextureShape.__annotations__}
-
-
-def _empty_texture(shape: dict[str, Json] | None) -> Texture | None:
-    """Make the texture of a file, without its values; allocate nothing, even if the metadata gives huge sizes."""
-    if shape is None:
-        return None
-    if KIND in shape:
         return _own_texture(shape)
+    known = {name: x for name, x in shape.items() if name in TextureShape.__annotations__}
     with torch.device("meta"):
-        return NeuralTexture(**cast(TextureShape, shape))
+        return NeuralTexture(**cast(TextureShape, known))
 
 
 def _stored_state(texture: Texture | None) -> dict[str, torch.Tensor]:

@@ -313,10 +313,7 @@ def jitter_factors(
     dtype: torch.dtype = torch.float32,
     generator: torch.Generator | None = None,
 ) -> torch.Tensor:
-    """Draw factors (H, W, K) on depths, which shift the texture's points along their rays: N(1, jitter / focal).
-
-    `jitter` is a standard deviation in pixels at the hit's depth; the generator is on the camera's device.
-    """
+    """Draw factors (H, W, K) on depths, N(1, jitter / focal), which shift the texture's points along their rays."""
     shape = (camera.height, camera.width, max_hits)
     noise = torch.randn(shape, generator=generator, dtype=dtype, device=camera.device)
     return noise.mul_(jitter / camera.focal).add_(1)

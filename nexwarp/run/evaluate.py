@@ -269,10 +269,7 @@ class VGG(torch.nn.Module):
         self.weights = {name: values.float() for name, values in weights.items()}
 
     def forward(self, image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Return the distance, a scalar, of two (H, W, 3) pictures.
-
-        The values go in as they are. The paper and 3DGS pass [0, 1], LPIPS's authors [-1, 1].
-        """
+        """Return the distance, a scalar, of two (H, W, 3) pictures as they are: the paper and 3DGS pass [0, 1]."""
         pictures = torch.stack([image, target]).permute(0, 3, 1, 2).float()
         shift, scale = (pictures.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
         features, distance = (pictures - shift) / scale, pictures.new_zeros(())

@@ -134,11 +134,7 @@ def _export_cameras(opened: OpenedModel, transforms: Path, camera_path: Path) ->
 
 
 def _originals(opened: OpenedModel) -> tuple[dict[str, str], dict[str, JsonObject]]:
-    """Return the files of a run's views, relative to the scene's folder, and the keys of their lenses by file.
-
-    Views that are no photo's, of a panorama or of a lens that nerfstudio does not know, have no keys, and names in a
-    folder of their own. If the scene is not there, all views have their names, and there is a warning.
-    """
+    """Return the files of a run's views in the scene's folder, and the keys of lenses that nerfstudio knows by file."""
     views = [name for members in opened.cameras.values() for name in members]
     images = SceneSource.images if opened.source is None else opened.source.images
     if opened.source is None or not views:

@@ -182,11 +182,7 @@ def read_metrics(run: Path) -> dict[str, Json]:
 
 
 def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool) -> bool:
-    """Check that a run folder may be created, resumed or overwritten; change nothing.
-
-    Return whether the folder holds a run to resume. False with `resume` too, if a process was killed before it wrote
-    the run's config: the training then starts from the beginning.
-    """
+    """Check that a run folder may be created, resumed or overwritten; return whether it holds a run to resume."""
     if resume and overwrite:
         raise SettingError("--resume, --overwrite: expected at most one of them, got both")
     if source.path != DEMO and Path(source.path).resolve().is_relative_to(run.resolve()):
@@ -354,10 +350,7 @@ def _view_pictures(run: Path) -> set[str]:
 
 
 def list_files(run: Path) -> tuple[list[str], list[str]]:
-    """Return the files below a run folder that have names of ours, and what else there is; links are not followed.
-
-    Names are relative to the folder. A foreign folder counts as one entry, with a slash at its end.
-    """
+    """Return the files below a run folder that have names of ours, and the rest; folders of others end with a slash."""
     own: list[str] = []
     foreign: list[str] = []
     pictures = set().union(*(_view_pictures(folder) for folder in (run, *teacher_folders(run))))
@@ -396,14 +389,11 @@ def delete_files(run: Path, keep: Iterable[str] = ()) -> list[str]:
 
 
 def remove_leftovers(run: Path) -> None:
-    """Remove the incomplete files that killed processes left; the caller holds the lock of the run folder.
-
-    Pictures, exports and camera paths are written without the lock: a temporary file of these stays while its process
-    may be at work.
-    """
+    """Remove the incomplete files that killed processes left; the caller holds the lock of the run folder."""
     folders = {folder for folder in run.iterdir() if re.fullmatch(_ASIDE, folder.name)}
     for name in list_files(run)[0]:
         folder, _, base = name.rpartition("/")
+        # Others are written without the lock: their processes may still be at work.
         locked = folder in CHECKPOINTS or (not folder and not base.startswith(".camera_path_"))
         aside = re.fullmatch(_ASIDE, folder)
         if aside or (is_temporary(base) and (locked or is_abandoned(run / name))):
@@ -418,10 +408,7 @@ def keep_camera_path(
     opened: Path | None = None,
     origin: tuple[float, float, float] | None = None,
 ) -> str:
-    """Write a camera path into a folder under the next free name; return the command that renders it.
-
-    `opened` is the run or model that the command names; None is the folder. `origin` is that of the cameras' frame.
-    """
+    """Write cameras of a frame with `origin` into a folder; return the command that renders `opened` from there."""
     folder.mkdir(parents=True, exist_ok=True)
     number = 1
     while True:
