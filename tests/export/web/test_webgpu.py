@@ -12,7 +12,7 @@ import nexwarp as nw
 from nexwarp.export.web.export import static_files
 from nexwarp.export.web.scene_file import encode_scene
 from nexwarp.model.options import RenderOptions
-from nexwarp.viewer.modes import facing_normals, id_colours
+from nexwarp.viewer.modes import Settings, _values
 from tests.export.web.support import CHROMIUM, URL, WEBGPU, Tab, entry_of, named_cameras, psnr, web_model
 from tests.export.web.test_scene_file import damaged
 from tests.scenes import make_camera, make_surfels, random_scene
@@ -193,11 +193,10 @@ def test_lists_grow_and_pictures_repeat_bit_for_bit(tab, default):
 def test_modes_show_the_buffers_of_the_heaviest_hit(tab, default):
     model, camera = default
     expected = model.render(camera)
-    ids = expected.ids[..., 0].long()
-    hit = (ids >= 0)[..., None]
-    normals = facing_normals(model.surfels, camera.position)[ids.clamp_min(0)]
-    pictures = {"ids": id_colours(ids) * hit, "normals": (0.5 + 0.5 * normals) * hit}
-    pictures["alpha"] = expected.alpha[..., None].expand(*ids.shape, 3)
+    hit = expected.ids[..., :1] >= 0
+    names = {"ids": "ids", "normals": "normal"}  # in the viewer
+    pictures = {mode: _values(expected, model.surfels, camera, Settings(mode=name)) for mode, name in names.items()}
+    pictures["alpha"] = expected.alpha[..., None].expand(*hit.shape[:2], 3)
     for mode, picture in pictures.items():
         shown = tab.render(camera, mode=mode)["image"]
         assert_close(shown, picture.contiguous(), kind="value", name=mode, allow_flips=FLIPS)
