@@ -73,8 +73,8 @@ MUTATIONS = [
     Mutation("cameras/camera.py", "return (depths > 0) &", "return (depths > -1e9) &", "tests/cameras tests/train/test_losses.py -k 'visible or points'"),
     Mutation("data/skybox.py", "2 * empty > seen", "2 * empty < seen", "tests/data/test_skybox.py"),
     # 39: training
-    Mutation("train/densify.py", "halved[rows, axis] -=", "halved[rows, axis] +=", DENSE),
-    Mutation("train/densify.py", "value[places] = 0", "pass", DENSE),
+    Mutation("train/densify.py", "log_scales[at, axis] -=", "log_scales[at, axis] +=", DENSE),
+    Mutation("train/densify.py", "value[sides != 0] = 0", "pass", DENSE),
     Mutation("train/densify.py", "/ errors\n", "* errors\n", DENSE),
     Mutation("train/densify.py", "c.start < iteration - late < c.stop", "c.start <= iteration - late <= c.stop", DENSE),
     Mutation("train/losses.py", "/ resolutions**3", "/ resolutions**2", "tests/train/test_losses.py"),
