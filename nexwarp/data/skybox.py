@@ -35,8 +35,6 @@ def skybox_points(views: Sequence[View], points: torch.Tensor, count: int) -> In
     Takes points (P, 3) of the scene, world frame, and returns at most `count`, none if photos show none. Normals point
     to the cameras' mean; a scale is half the distance between neighbours.
     """
-    if count < 1:
-        raise ValueError(f"count: expected at least 1, got {count}")
     chosen = torch.linspace(0, len(views) - 1, min(len(views), MOST_VIEWS)).round().long().tolist()
     judges = [views[index] for index in chosen]
     positions = torch.stack([view.camera.position.double() for view in views])

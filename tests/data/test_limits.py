@@ -179,13 +179,6 @@ def test_counts_are_checked_before_they_are_believed(tmp_path, name):
     refused(path, rf"{name}\.bin: damaged, expected {len(good):,} bytes as its counts say, got {len(good) + 1:,}")
 
 
-def test_observations_of_images_that_are_not_there(tmp_path):
-    path = make_scene(tmp_path)
-    overwrite(path / "sparse/0/points3D.bin", 8 + 51, struct.pack("<I", 77))
-    with pytest.warns(UserWarning, match="1 observations of points are of 1 images .* id 77; left out"):
-        assert load_scene(path).track_lengths.sum() == 70 - 1
-
-
 def test_poses_of_a_rig_are_those_of_pycolmap(tmp_path):
     pycolmap = pycolmap_module()
     rng = np.random.default_rng(1)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from nexwarp.data import initial_points, load_scene
+from nexwarp.data import load_scene
 from nexwarp.data.scene import find_format
 from tests.data.inputs.support import assert_same_cameras, edit
 from tests.data.test_scene import make_scene, project, views_of
@@ -35,6 +35,7 @@ def test_points_beside_a_blender_scene(demo, tmp_path):
     scene = load_scene(path)
     assert np.array_equal(scene.points.numpy(), points.astype(np.float32))
     assert scene.train[0].points is None and scene.track_lengths.eq(0).all()
+    assert scene.reprojection_errors.eq(-1).all(), "what the file does not say is unknown"
     write_points(path / "other.ply", 2 * points, colors)
     edit(path, lambda data: data.update(ply_file_path="other.ply"), "transforms_train.json")
     assert np.array_equal(load_scene(path).points.numpy(), (2 * points).astype(np.float32))
@@ -43,16 +44,6 @@ def test_points_beside_a_blender_scene(demo, tmp_path):
     (path / "points3d.ply").symlink_to(tmp_path / "elsewhere.ply")
     with pytest.raises(ValueError, match=r"points .points3d.ply.: a link leaves"):
         load_scene(path)
-
-
-def test_what_nerfstudio_does_not_say_about_points_is_unknown(demo, tmp_path):
-    scene = load_scene(write_nerfstudio(demo, tmp_path / "scene"))
-    assert all(view.points is None for view in scene.train)
-    assert scene.track_lengths.eq(0).all() and scene.reprojection_errors.eq(-1).all()
-    chosen = initial_points(
-        scene.points, scene.colors, 10**6, track_lengths=scene.track_lengths, errors=scene.reprojection_errors
-    )
-    assert len(chosen.means) == len(scene.points), "no point is dropped for what is not known"
 
 
 def test_blender_alone_has_an_angle_and_a_centred_square_camera(tmp_path):
