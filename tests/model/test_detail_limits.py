@@ -11,7 +11,7 @@ from nexwarp.model.render import antialiased
 from nexwarp.model.render import draw as draw_parts
 from nexwarp.model.texture import NEVER, DetailLimits
 from nexwarp.train.finish import measure_detail_limits
-from tests.render_support import BACKGROUND, MAX_HITS, assert_same
+from tests.render_support import BACKGROUND, assert_same
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
@@ -146,26 +146,6 @@ def test_limits_are_those_of_the_closest_and_the_farthest_look(device: torch.dev
     for mine, expected, name in ((found.nearest, closest, "nearest"), (found.farthest, farthest, "farthest")):
         assert_close(mine.cpu(), expected, kind="value", name=name)
         assert ((mine.cpu() - expected).abs() <= 2e-5 * expected).all(), name
-
-
-def test_training_views_are_as_training_made_them(device: torch.device) -> None:
-    """In 8 bits: looks at hits of lower weights, or beyond the K heaviest of a pixel, do not count."""
-    scene = random_scene(60, device=device)
-    surfels, texture, camera = make_surfels(scene), make_texture(device=device, residual=True), make_camera(scene)
-    texture.half_precision = False
-    moved = camera.viewmat.detach() + torch.tensor([[0.0] * 4, [0.0] * 4, [0.0] * 3 + [1.5], [0.0] * 4], device=device)
-    cameras = [camera, dataclasses.replace(camera, viewmat=moved)]
-    options = nw.RenderOptions(max_hits=MAX_HITS, background=BACKGROUND)
-    trained = nw.Model(surfels, texture, options=options)
-    before = [out.image for out in trained.render(cameras)]
-    training = measure_detail_limits(trained, cameras)
-    model = nw.Model(surfels, texture, detail_limits=training, options=options)
-    for c, image in zip(cameras, before, strict=True):
-        after = model.render(c).image
-        assert (after - image).abs().max() < 1 / 255
-    far = dataclasses.replace(camera, viewmat=2 * moved - camera.viewmat.detach())
-    wide = antialiased(surfels.activated(), far, training).scales > 1.001 * surfels.scales
-    assert wide.any()
 
 
 def test_no_surfels_have_no_limits(device: torch.device) -> None:
