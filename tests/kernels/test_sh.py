@@ -89,7 +89,3 @@ def test_clamped_channels_have_no_gradient(device: torch.device) -> None:
     colors = ops.plain_colors((dark, dark.new_zeros(4, 0, 3)), means.new_ones(4, 3), position.new_zeros(3), 0)
     (gradient,) = torch.autograd.grad(colors.sum(), dark)
     assert not colors.any() and not gradient.any()
-
-
-def test_gradcheck(device: torch.device) -> None:
-    assert torch.autograd.gradcheck(lambda *x: colors_of(list(x), 3), make(6, 3, torch.float64, device))

@@ -57,16 +57,6 @@ def test_widening_is_what_torch_gives(dtype: torch.dtype, device: torch.device) 
         assert torch.equal(mine[~far], given[~far])
 
 
-def test_widening_gradcheck(device: torch.device) -> None:
-    shape, farthest = arguments(9, torch.float64, device)
-
-    def widened(depths: torch.Tensor, *rest: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        scales, opacities, gammas = rest
-        return ops.antialias(depths, scales, opacities, gammas, farthest, 90.0)
-
-    assert torch.autograd.gradcheck(widened, [x.requires_grad_() for x in shape])
-
-
 def test_widening_of_extremes_is_finite(device: torch.device) -> None:
     """And what is far larger than a pixel stays as it is."""
     shape, farthest = arguments(8, torch.float32, device)

@@ -160,20 +160,6 @@ def test_near_tests_the_depth_of_the_hit() -> None:
         value_of(hits.depths[2, 2], depths, "depths")
 
 
-@pytest.mark.parametrize("max_hits", [0, 2])
-def test_gradients_of_collect(max_hits: int) -> None:
-    scene = random_scene(6, seed=7, width=4, height=3, off_centre=True, dtype=torch.float64)
-    colors = torch.rand(6, 3, dtype=torch.float64)
-    inputs = leaves(*(scene[key] for key in FLOATS), colors, scene["viewmat"])
-
-    def blend(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        hits = collect(Shape(*tensors[:5]), tensors[5], tensors[6], view_of(scene), max_hits)
-        return hits.plain, hits.base, hits.depths, hits.weights, hits.alpha
-
-    assert blend(*inputs)[4].max() > 0.3
-    assert torch.autograd.gradcheck(blend, inputs)
-
-
 # The hash grid
 
 
@@ -203,25 +189,6 @@ def test_encode_at_a_corner_and_between() -> None:
         ]),
     ])  # fmt: skip
     assert_close(features, expected, kind="value", name="features")
-
-
-def test_gradients_of_encode() -> None:
-    inputs = leaves(
-        torch.randn(5, 3, dtype=torch.float64),
-        1 + torch.rand(5, dtype=torch.float64),
-        torch.randn(3, 16, 2, dtype=torch.float64),
-    )
-    resolutions = tensor(1.0, 1.7, 3.0)
-    assert torch.autograd.gradcheck(lambda x, t, grid: encode(x, t, grid, resolutions, focal=4.0), inputs)
-
-
-def test_gradients_of_plain_colors() -> None:
-    inputs = leaves(
-        0.2 * torch.randn(3, 16, 3, dtype=torch.float64),
-        torch.randn(3, 3, dtype=torch.float64),
-        tensor(3.0, -4.0, 5.0),
-    )
-    assert torch.autograd.gradcheck(lambda sh, means, position: plain_colors(sh, means, position, degree=3), inputs)
 
 
 # The whole

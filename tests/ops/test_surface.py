@@ -16,10 +16,8 @@ from tests.scenes import (
     layered_scene,
     make_camera,
     make_surfels,
-    moved_scene,
     named_scene,
     random_scene,
-    rigid,
 )
 from tests.tolerances import FLIPS, assert_close
 
@@ -89,26 +87,6 @@ def test_depths_of_layers_by_hand(device: torch.device) -> None:
     out = draw(facing_quads((2.0, 0.3), (5.0, 0.2), device=device))
     assert_everywhere(out.median_depth, 5.0, "median depth")
     assert_everywhere(out.top_depth, 2.0, "top depth")
-
-
-def test_a_rigid_motion_turns_normals_and_keeps_depths(device: torch.device) -> None:
-    scene = random_scene(dtype=torch.float64, device=device)
-    quat = (0.3, -0.7, 0.4, 0.5)
-    out, expected = draw(moved_scene(scene, quat, (3.0, -1.0, 2.0))), draw(scene)
-    turn = rigid(quat, (0.0, 0.0, 0.0)).to(device)[:3, :3]
-    for name in DEPTHS:
-        assert_close(getattr(out, name), getattr(expected, name), kind="value", name=name)
-    assert_close(out.normals, expected.normals @ turn.T, kind="value", name="normals")
-
-
-def test_with_room_for_all_hits_the_buffer_has_the_expected_and_the_top_depth(device: torch.device) -> None:
-    scene = random_scene(MAX_HITS, dtype=torch.float64, device=device)
-    out = draw(scene, max_hits=MAX_HITS)
-    total = out.weights.sum(-1)
-    mean = (out.weights * out.depths).sum(-1) / torch.where(total > 0, total, 1.0)
-    assert total.any() and not total.all()
-    assert_close(out.expected_depth, mean.detach(), kind="value", name="expected depth")
-    assert_close(out.top_depth, out.depths[..., 0].detach(), kind="value", name="top depth")
 
 
 @pytest.mark.parametrize("max_hits", [0, 1, MAX_HITS])
