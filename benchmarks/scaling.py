@@ -29,10 +29,8 @@ from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.densify import DensityControl, split_surfels
 from nexwarp.train.parallel import ParallelTrainer
-from nexwarp.train.ranks.launch import launch
-from nexwarp.train.ranks.ranks import GradientReducer, Ranks
-from nexwarp.train.recipe import DEMO_SETTINGS, Config, preset
-from nexwarp.train.settings import parse_settings, with_settings
+from nexwarp.train.ranks.ranks import GradientReducer, Ranks, launch
+from nexwarp.train.recipe import DEMO_SETTINGS, Config, parse_settings, preset, with_settings
 from nexwarp.train.trainer import Trainer
 
 DEMO = "demo"

@@ -8,8 +8,7 @@ from typing import Any
 
 from nexwarp.data import Scene, load_scene
 from nexwarp.data.scene import TEST_EVERY
-from nexwarp.train.recipe import Config, preset
-from nexwarp.train.settings import with_settings
+from nexwarp.train.recipe import Config, preset, with_settings
 
 SCENES = ("train", "fox", "saharov", "kitchen25")
 SIZE, ITERATIONS = 40_000, 30_000  # of a training at full size

@@ -21,7 +21,7 @@ from nexwarp.cli.train import Train
 from nexwarp.errors import NexwarpError, RankError
 from nexwarp.io.files import printable
 from nexwarp.machine import needed_memory
-from nexwarp.train.ranks.launch import end_process, launch, may_speak
+from nexwarp.train.ranks.ranks import end_process, launch, may_speak
 
 PROGRAM = ("-m", "nexwarp")  # what the ranks of a training run
 CLOSED_PIPE = 128 + 13  # SIGPIPE, which other systems do not have

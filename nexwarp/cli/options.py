@@ -14,8 +14,7 @@ from nexwarp.cli import __version__
 from nexwarp.errors import RankError, SettingError
 from nexwarp.kernels.launch import get_num_threads, set_num_threads
 from nexwarp.kernels.types import MAX_HITS
-from nexwarp.train.ranks.launch import is_rank
-from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.ranks.ranks import Ranks, is_rank
 
 
 def option(metavar: str, default: str | None = None) -> object:

@@ -34,10 +34,8 @@ from nexwarp.run.folder import (
 )
 from nexwarp.run.log import check_tensorboard
 from nexwarp.train.initial import Start, check_start
-from nexwarp.train.ranks.launch import check_count, is_rank
-from nexwarp.train.ranks.ranks import Ranks
-from nexwarp.train.recipe import DEMO_SETTINGS, Config, preset
-from nexwarp.train.settings import parse_settings, setting, with_settings
+from nexwarp.train.ranks.ranks import Ranks, check_count, is_rank
+from nexwarp.train.recipe import DEMO_SETTINGS, Config, parse_settings, preset, setting, with_settings
 from nexwarp.train.stages import NO_TEACHERS, StageRunner, plan_teachers
 
 if TYPE_CHECKING:

@@ -31,8 +31,7 @@ from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load
 from nexwarp.train.checkpoint import CHECKPOINT_FILES, CHECKPOINTS
-from nexwarp.train.recipe import MIN_SURFELS, MOST_TEACHERS, Config
-from nexwarp.train.settings import config_from_dict
+from nexwarp.train.recipe import MIN_SURFELS, MOST_TEACHERS, Config, config_from_dict
 from nexwarp.train.stages import NO_TEACHERS, OwnTeachers
 
 CONFIG_FILE = "config.json"

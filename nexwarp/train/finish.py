@@ -133,7 +133,7 @@ def _smooth(coefficients: torch.Tensor, ids: torch.Tensor, equations: torch.Tens
     count, device = coefficients.shape[1], coefficients.device
     degrees = torch.arange(count, device=device, dtype=torch.float64).sqrt().floor()
     penalty = strength * (degrees * (degrees + 1) / 12).square()
-    row, column = _pairs(count, device)
+    row, column = torch.triu_indices(count, count, device=device).unbind()
     left = equations.new_zeros(len(ids), count, count)
     left[:, row, column] = left[:, column, row] = equations
     left += torch.diag(penalty)
@@ -154,7 +154,7 @@ def seen_directions(
     bare = model.bare()
     surfels = bare.surfels
     count = _count(model)
-    row, column = _pairs(count, surfels.device)
+    row, column = torch.triu_indices(count, count, device=surfels.device).unbind()
     products = torch.zeros(len(ids), len(row), dtype=torch.float64, device=surfels.device)
     total = products.new_zeros(len(ids))
     for number, view in enumerate(views, 1):
@@ -168,12 +168,6 @@ def seen_directions(
         total += weights
         progress(number)
     return products, total
-
-
-def _pairs(count: int, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rows and columns of the upper triangle."""
-    row, column = torch.triu_indices(count, count, device=device)
-    return row, column
 
 
 def _count(model: Model) -> int:

@@ -1,6 +1,6 @@
 """The trainings that make up a run: for captures of few photos, teachers of its own come before the student.
 
-Not in the paper. What a student learns from teachers is in `nexwarp.train.teachers`.
+Not in the paper. What a student learns from teachers is in `nexwarp.train.target`.
 """
 
 import dataclasses

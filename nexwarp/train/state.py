@@ -24,8 +24,7 @@ from nexwarp.train.checkpoint import Snapshot
 from nexwarp.train.densify import DensityControl
 from nexwarp.train.initial import Start, cells_unit, given_surfels, initial_poses, initial_surfels, initial_texture
 from nexwarp.train.optimizer import FusedAdam, OptimizerMaker, make_optimizer
-from nexwarp.train.recipe import Config
-from nexwarp.train.settings import config_from_dict, refuse_removed
+from nexwarp.train.recipe import Config, config_from_dict, refuse_removed
 
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
 CPU_GENERATOR = 5056  # bytes of the state of a generator on a CPU, a Mersenne twister

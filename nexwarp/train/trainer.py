@@ -25,8 +25,7 @@ from nexwarp.train.optimizer import OptimizerMaker, set_rates
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport, check_health, oom_message
 from nexwarp.train.state import TrainingState, check_origin, check_snapshot, checkpoint_errors, scene_digest
-from nexwarp.train.target import Target, TargetSource, refined
-from nexwarp.train.teachers import TaughtTargets, check_teachers, teachers_digest
+from nexwarp.train.target import Target, TargetSource, TaughtTargets, check_teachers, refined, teachers_digest
 
 CHECK_EVERY = 100  # iterations between checks that all numbers are finite
 SNAPSHOTS = 10  # that a run takes, one replacing the other

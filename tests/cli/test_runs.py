@@ -15,7 +15,7 @@ from nexwarp.cli import main as cli
 from nexwarp.io.pictures import CAPTION_HEIGHT, to_uint8
 from nexwarp.run.evaluate import CONVENTION, psnr
 from nexwarp.run.folder import list_files
-from nexwarp.train.settings import config_from_dict
+from nexwarp.train.recipe import config_from_dict
 from nexwarp.train.trainer import Trainer
 from tests.cli.support import FLAGS, RUN_FILES, SMALL, picture, read, snapshot
 from tests.data.test_scene import make_scene

@@ -25,8 +25,7 @@ import pytest
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
-from nexwarp.train.recipe import PRESETS, USER_SETTINGS, Config, preset
-from nexwarp.train.settings import setting, setting_names, with_settings
+from nexwarp.train.recipe import PRESETS, USER_SETTINGS, Config, preset, setting, setting_names, with_settings
 
 DOCS = Path(__file__).parents[2] / "docs"
 ROOT = DOCS.parent

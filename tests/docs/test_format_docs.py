@@ -17,7 +17,7 @@ import nexwarp as nw
 from examples import read_model
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
-from nexwarp.train.settings import setting_names
+from nexwarp.train.recipe import setting_names
 from tests.docs.test_docs import DOCS, ROOT
 from tests.scene_writers import expose_photos, write_demo
 

@@ -17,8 +17,7 @@ from nexwarp.data import Scene, View
 from nexwarp.model import graphs as step_graphs
 from nexwarp.train import target as training_views
 from nexwarp.train.densify import DensityControl
-from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
-from nexwarp.train.settings import with_settings
+from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig, with_settings
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 from tests.trainer_support import assert_same_state

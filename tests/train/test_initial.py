@@ -7,18 +7,13 @@ import pytest
 import torch
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.data import Scene, initial_points
+from nexwarp.data import initial_points
 from nexwarp.train.initial import initial_surfels, quats_towards, texture_shape
 from nexwarp.train.recipe import TextureConfig, preset
 from tests.reference.collect import rotations
 from tests.trainer_support import TEXTURE, rescaled, small
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
-
-@pytest.fixture(scope="session")
-def scene(tiny_scene: Scene) -> Scene:
-    return tiny_scene
 
 
 @pytest.mark.parametrize("factor", [100.0, 1e-3])

@@ -18,11 +18,6 @@ pytestmark = pytest.mark.usefixtures("one_torch_thread")
 TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
 
 
-@pytest.fixture(scope="session")
-def scene(tiny_scene: Scene) -> Scene:
-    return tiny_scene
-
-
 def make_trainer(scene: Scene, **settings) -> Trainer:
     values: dict[str, Any] = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE} | settings
     return Trainer(scene, Config(**values), "cpu")

@@ -20,8 +20,7 @@ from nexwarp.model.texture import NeuralTexture
 from nexwarp.train import recipe
 from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.parallel import MOST_CAPTURED_BYTES, ParallelTrainer, scale_for_batch, sums_beside
-from nexwarp.train.ranks.launch import check_count
-from nexwarp.train.ranks.ranks import WAIT_VARIABLE, Ranks
+from nexwarp.train.ranks.ranks import WAIT_VARIABLE, Ranks, check_count
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.ranks_support import (
@@ -49,11 +48,6 @@ SMALL = Config(
     densify=DensifyConfig(every=3),
 )
 TRAIN = ["--iterations", "24", "--max-surfels", "100", "--device", "cpu", "--checkpoint-every", "2"]
-
-
-@pytest.fixture(scope="module")
-def scene(tiny_scene: Scene) -> Scene:
-    return tiny_scene
 
 
 def long_config(size: int, steps: int) -> Config:

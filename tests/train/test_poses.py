@@ -18,8 +18,7 @@ from nexwarp.run.fit_poses import fit_poses
 from nexwarp.train import recipe
 from nexwarp.train.initial import initial_poses
 from nexwarp.train.optimizer import rate_ends
-from nexwarp.train.recipe import DEMO_SETTINGS, DensifyConfig, LearningRates, preset
-from nexwarp.train.settings import with_settings
+from nexwarp.train.recipe import DEMO_SETTINGS, DensifyConfig, LearningRates, preset, with_settings
 from nexwarp.train.target import with_cameras
 from nexwarp.train.trainer import Trainer
 from tests import scenes

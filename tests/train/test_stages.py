@@ -133,6 +133,12 @@ def finished(command: Callable[..., int], tmp_path_factory: pytest.TempPathFacto
     return run
 
 
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return shutil.copytree(finished, tmp_path / "run")
+
+
 def model_of(run: Path) -> bytes:
     return (run / "model.safetensors").read_bytes()
 
@@ -142,9 +148,7 @@ def test_the_command_does_what_train_does(finished: Path, tiny_scene: Scene, tmp
     assert same(nw.load(finished), nw.load(expected.save(tmp_path)))
 
 
-def test_a_teacher_is_a_run(finished: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
+def test_a_teacher_is_a_run(run: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text())
     assert metrics["iterations"] == 20 and metrics["teachers"] == 2 and "psnr" in metrics
     assert read_run(run).config.iterations == 20 and dataclasses.asdict(read_run(run).own) == OWN
@@ -163,11 +167,9 @@ def test_a_teacher_is_a_run(finished: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("lost", ["student", "teacher 2", "all"])
 def test_a_run_resumes_in_each_stage(
-    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str], lost: str
+    run: Path, finished: Path, command: Callable[..., int], capsys: pytest.CaptureFixture[str], lost: str
 ) -> None:
     """With the bits of an uninterrupted one, whatever it still has to train; complete teachers stay as they are."""
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
     for name in (*CHECKPOINTS, "renders"):
         shutil.rmtree(run / name, ignore_errors=True)
     for name in ("model.safetensors", "metrics.json", "metrics.jsonl", "cameras.json"):
@@ -220,12 +222,8 @@ def test_a_stopped_run_goes_on_where_it_was(
     assert len(taken) == 20 - stop and model_of(run) == model_of(finished)
 
 
-def test_a_longer_run_keeps_its_teachers(
-    finished: Path, command: Callable[..., int], tmp_path: Path, tiny_scene: Scene
-) -> None:
+def test_a_longer_run_keeps_its_teachers(run: Path, command: Callable[..., int], tiny_scene: Scene) -> None:
     """All further iterations are the student's."""
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
     teachers = [(run / "teachers" / name / "model.safetensors").read_bytes() for name in "12"]
     assert command(run, "--resume", iterations=30) == 0
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
@@ -238,10 +236,8 @@ def test_a_longer_run_keeps_its_teachers(
 
 
 def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(
-    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Path, command: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
     for name in ("teachers/1/notes.txt", "teachers/3/model.safetensors", "teachers/mine.txt"):
         (run / name).parent.mkdir(exist_ok=True)
         (run / name).write_text("mine")
@@ -257,11 +253,14 @@ def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(
 
 @pytest.mark.parametrize("kind", ["foreign", "link", "file"])
 def test_what_is_not_the_runs_is_not_taken_for_a_teacher(
-    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+    run: Path,
+    finished: Path,
+    command: Callable[..., int],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    kind: str,
 ) -> None:
     """Nor overwritten: nothing changes."""
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
     place = run / "teachers"
     if kind == "foreign":  # of a run that has no teachers of its own
         create_run(run, RunRecord(SceneSource("demo"), CONFIG))
@@ -281,10 +280,8 @@ def test_what_is_not_the_runs_is_not_taken_for_a_teacher(
 
 
 def test_a_run_that_lost_a_teacher_says_so_before_it_trains(
-    finished: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: Path, finished: Path, command: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = tmp_path / "run"
-    shutil.copytree(finished, run)
     shutil.rmtree(run / "teachers" / "2")
     capsys.readouterr()
     assert command(run, "--resume", iterations=30) == 2

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.data import Scene, View
+from nexwarp.data import View
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.recipe import DensifyConfig, LearningRates
 from nexwarp.train.trainer import Trainer
@@ -20,11 +20,6 @@ from tests.tolerances import assert_close
 from tests.trainer_support import OFTEN, TEXTURE, assert_resumed_alike, assert_same_state, rescaled, small, trained
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
-
-@pytest.fixture(scope="session")
-def scene(tiny_scene: Scene) -> Scene:
-    return tiny_scene
 
 
 def mean_psnr(trainer: Trainer, views: list[View]) -> float:

@@ -27,11 +27,6 @@ SMALL = nw.Config(
 )
 
 
-@pytest.fixture(scope="module")
-def scene(tiny_scene: Scene) -> Scene:
-    return tiny_scene
-
-
 def run(scene: Scene, until: int | None = None, **options: Any) -> nw.Trainer:
     trainer = nw.Trainer(scene, SMALL, "cpu", **options)
     trainer.run(until=until)
