@@ -90,9 +90,9 @@ class _UnitQuats(torch.autograd.Function):
 
     @staticmethod
     @first_derivative
-    def backward(ctx: Context, grads: torch.Tensor) -> torch.Tensor:
+    def backward(ctx: Context, grads: torch.Tensor) -> tuple[torch.Tensor]:
         (quats,) = ctx.saved_tensors
         grad_quats, vec4 = torch.empty_like(quats), types(real_of(quats)).vec4
         inputs = [array(quats, vec4), array(grads.contiguous(), vec4)]
         launch(quats, unit_kernels(real_of(quats)).backward, len(quats), inputs, [array(grad_quats, vec4)])
-        return grad_quats
+        return (grad_quats,)
