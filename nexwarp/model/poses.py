@@ -1,6 +1,6 @@
 """Rigid corrections of the training cameras, learned with the scene. Not in the paper."""
 
-import dataclasses
+import copy
 import math
 from collections.abc import Sequence
 
@@ -91,8 +91,9 @@ class PoseCorrections(nn.Module):
 
     def camera(self, given: Camera, view: int | torch.Tensor) -> Camera:
         """Return the corrected camera of a view, whose image may have been cropped or reduced; differentiable."""
-        checked = (given.fx, given.fy, given.cx, given.cy)
-        return dataclasses.replace(given, viewmat=self.viewmat(given.viewmat, view), checked=checked)
+        corrected = copy.copy(given)  # of its own class: a staged camera has its focal length on the device
+        vars(corrected)["viewmat"] = self.viewmat(given.viewmat, view)
+        return corrected
 
     @torch.no_grad()
     def cameras(self, given: Sequence[Camera]) -> list[Camera]:

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp.cameras.camera import StagedCamera
 from nexwarp.cameras.paths import look_at
 from nexwarp.cli import main as cli
 from nexwarp.data import Scene, demo_folder
@@ -95,6 +96,19 @@ def test_a_common_motion_and_scale_of_all_cameras_is_no_correction(tiny_scene):
     alone.load(torch.randn(1, 6))
     alone.keep_gauge()
     assert alone.corrections.abs().max() < 1e-5  # a single camera has no pose of its own to refine
+
+
+def test_a_corrected_camera_of_a_graph_stays_one(tiny_scene):
+    """What a CUDA graph reads lies on the device: its focal length must not become a number."""
+    poses = PoseCorrections([view.camera for view in tiny_scene.train], tiny_scene.scale)
+    poses.load(0.01 * torch.randn(poses.corrections.shape, generator=torch.Generator().manual_seed(0)))
+    first, second = (view.camera for view in tiny_scene.train[:2])
+    staged = StagedCamera(first, torch.device("cpu"))
+    staged.copy_(second)
+    corrected, expected = poses.camera(staged, torch.tensor([1])), poses.camera(second, 1)
+    assert torch.equal(corrected.viewmat, expected.viewmat) and not torch.equal(corrected.viewmat, second.viewmat)
+    staged.numbers[25] = 7.0
+    assert corrected.focal == 7.0
 
 
 def test_short_runs_take_longer_steps():
