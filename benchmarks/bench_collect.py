@@ -81,7 +81,7 @@ def rasterize(scene: SurfelScene, options: Options) -> list[Measurement]:
 
     def plain(colors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         hits = nw.rasterize(*g.shape, colors, scene.camera, MAX_HITS)
-        return (*outputs(hits), hits.points, hits.directions)
+        return hits.plain, hits.depths, hits.weights, hits.alpha, hits.points, hits.directions
 
     def timed(name: str, run: Callable[[torch.Tensor], tuple[torch.Tensor, ...]], colors: torch.Tensor) -> Measurement:
         leaves, results = (*g.shape, colors), differentiable(run(colors))
