@@ -39,9 +39,9 @@ def test_rays_of_a_pinhole_turned_anywhere_show_its_picture(device, yaw, pitch):
     turn = torch.tensor([[c, 0, -s], [s * e, d, c * e], [s * d, -e, c * d]])
     view = VIEWMAT.clone()
     view[:3] = turn @ VIEWMAT[:3]
-    camera = nw.Camera(view, torch.tensor([[90.0, 0, 48], [0, 90.0, 40], [0, 0, 1]]), 96, 80).to(device)
-    rays = nw.RayCamera(VIEWMAT, rays_of(camera) @ turn, camera.near, camera.focal).to(device)
-    out, expected = model.render(rays), model.render(camera, order="distance")
+    camera = nw.Camera(view, torch.tensor([[90.0, 0, 48], [0, 90.0, 40], [0, 0, 1]]), 96, 80)
+    rays = nw.RayCamera(VIEWMAT, rays_of(camera) @ turn, camera.near, camera.focal)
+    out, expected = (model.render(x.to(device), order="distance") for x in (rays, camera))
     for name in ("image", "plain", "textured", "alpha"):
         assert (getattr(out, name) - getattr(expected, name)).square().mean().sqrt() < 0.02, name
     for name in ("weights", "depths", "expected_depth", "median_depth", "top_depth", "normals"):

@@ -67,16 +67,16 @@ def test_a_rendering_or_gradient_that_lacks_memory_can_be_repeated(device):
     assert len(counted.requests) > 20
     failed, all_fatal = 0, chosen(len(counted.requests), device)
     for fatal in all_fatal:
+        found = None
         try:
-            with failing_gpu(fatal) as asked:
-                results()
+            with failing_gpu(fatal):
+                found = results()  # on a GPU it may succeed: frames are launched where a graph lacks memory
         except (OutOfMemoryError, torch.OutOfMemoryError) as error:
             assert "2.00 GiB" in str(error)
             failed += 1
-        else:
-            assert len(asked.requests) <= fatal  # frames that are no longer captured ask for less
-        assert all(torch.equal(a, b) for a, b in zip(results(), expected, strict=True)), fatal
-    assert failed > 0.8 * len(all_fatal)
+        for again in (found or expected, results()):
+            assert all(torch.equal(a, b) for a, b in zip(again, expected, strict=True)), fatal
+    assert failed == len(all_fatal) if device.type == "cpu" else failed > 0.5 * len(all_fatal)
 
 
 # Memory, training
