@@ -174,7 +174,7 @@ def test_compiled_code_calls_a_rendering_as_it_is(name, device):
     assert_close(value, expected, kind="value", name=name)
     grads = [torch.autograd.grad(x, means)[0] for x in (value, expected)]
     assert_close(*grads, kind="gradient", name=name)
-    with pytest.raises(Exception, match="intentionally marked"):
+    with pytest.raises(Exception, match=r"intentionally marked|torch\.compiler\.disable"):  # of torch 2.15
         torch.compile(draws[name], backend="eager", fullgraph=True)(means)
 
 
