@@ -20,14 +20,14 @@ INVERSE_ERROR = 1e-6  # radius, relative to the focal length, by which the inver
 class RayCamera:
     """A camera with one ray for each pixel, all from its centre, for rendering; not differentiable.
 
-    `panorama` and `fisheye` make one. Its pictures are resampled from the faces of a cube, pinhole pictures with
-    pixels of two thirds of the size. A hit's depth is in units of its pixel's ray: the distance from the camera for
-    panoramas and fisheye lenses.
+    `panorama` and `fisheye` make one. Its pictures are resampled from pinhole pictures, the faces of a cube, which have
+    twice the resolution up to 4,096 pixels a side. A hit's depth is in units of its pixel's ray: the distance from the
+    camera for panoramas and fisheye lenses.
 
     Attributes:
         viewmat: (4, 4) float, world to camera, a rigid motion; x right, y down, z forward.
         rays: (H, W, 3) float, camera frame, directions of any length; a pixel whose ray is 0 sees nothing.
-        near: hits are ignored whose depth along the axis of their face is at most this.
+        near: hits are ignored whose z-depth in the picture of their face is at most this.
         focal: pixels in a world unit at depth 1: f of paper Eq. 4; at most 16,384.
 
     Raises:

@@ -16,8 +16,8 @@ from nexwarp.model.render import Rendering, draw
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import Texture
 
-FINER = 2.0  # pixels of a face's middle, for each of the ray camera
-MOST_FINER = 4096  # pixels along a face's side that this makes, at most
+FINER = 2.0  # resolution of a face's middle over that of the ray camera
+MOST_FINER = 4096  # pixels along a face's side that FINER asks for, at most
 MARGIN = 2  # pixels around a face: bilinear samples at its border need them
 FACING = (  # rows: right, down and forward of each face, in the ray camera's frame
     ((1, 0, 0), (0, 1, 0), (0, 0, 1)),

@@ -302,7 +302,7 @@ class Config(Recipe):
         return self.max_hits if iteration >= settled else min(self.max_hits, 2)
 
     def normals_at(self, iteration: int) -> float:
-        """Factor of the normal loss at an iteration of this run: 0 before it starts."""
+        """Factor of the normal loss at an iteration of this run: 0 in its first 7/30."""
         return self.losses.normals if iteration / self.iterations >= NORMALS_FROM / REFERENCE_ITERATIONS else 0.0
 
     def as_dict(self) -> dict[str, Any]:
