@@ -4,7 +4,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from benchmarks.quality.jobs import DEFAULT, ITERATIONS, PEERS, RAW, RAW_PEERS, SCENES, SIZE, Row
+from benchmarks.quality.jobs import DEFAULT, ITERATIONS, PEERS, SCENES, SIZE
 from benchmarks.quality.results import Results
 
 # A block stands between the lines <!-- results: NAME --> and <!-- end of results -->.
@@ -21,7 +21,7 @@ def blocks(results: Results) -> dict[str, str]:
         for job, result in results.items()
         if (job.variant, job.downscale, job.iterations) == ("", 1, ITERATIONS)
     }
-    return {"readme": readme(full), "peers": peers(full), "raw": raw(full)}
+    return {"readme": readme(full), "peers": peers(full)}
 
 
 def fill(page: str, tables: Mapping[str, str]) -> str:
@@ -39,9 +39,9 @@ def cell_of(results: Results, scene: str, row: str, size: int) -> Cell:
     return [x for job, x in results.items() if (job.scene, job.row, job.size) == (scene, row, size)]
 
 
-def best_peer(results: Results, scene: str, size: int, rows: Iterable[Row] = PEERS) -> Cell:
+def best_peer(results: Results, scene: str, size: int) -> Cell:
     """Return the results of the gsplat row with the best mean PSNR; none where none was run."""
-    cells = [cell_of(results, scene, row.name, size) for row in rows]
+    cells = [cell_of(results, scene, row.name, size) for row in PEERS]
     return max(cells, key=lambda cell: mean(cell, "psnr") if cell else float("-inf"))
 
 
@@ -50,10 +50,9 @@ def mean(cell: Cell, metric: str) -> float:
     return sum(result[metric] for result in cell) / len(cell)
 
 
-def figures(cell: Cell, last: str = "flip") -> str:
-    """Return the means of PSNR, SSIM and FLIP, or of another metric in its place, over the seeds that have it."""
-    cell = [result for result in cell if result[last] is not None]
-    return f"{mean(cell, 'psnr'):.2f}, {mean(cell, 'ssim'):.4f}, {mean(cell, last):.4f}" if cell else MISSING
+def figures(cell: Cell) -> str:
+    """Return the means of PSNR, SSIM and FLIP."""
+    return f"{mean(cell, 'psnr'):.2f}, {mean(cell, 'ssim'):.4f}, {mean(cell, 'flip'):.4f}" if cell else MISSING
 
 
 def readme(results: Results) -> str:
@@ -82,19 +81,6 @@ def peers(results: Results) -> str:
         margin = f"{mean(own, 'psnr') - mean(best, 'psnr'):+.2f} dB" if own and best else MISSING
         lines.append([scene, f"{size:,}", *(figures(cell) for cell in (own, example, best)), margin])
     header = ["scene", "primitives", "nexwarp", "gsplat as in its example", "gsplat, best row", "nexwarp less best"]
-    return f"{_table(header, lines)}\n\n{_caption(shown)}"
-
-
-def raw(results: Results) -> str:
-    """Return the comparison without exposures on either side, with LPIPS."""
-    lines, shown = [], []
-    for scene in (*SCENES, "treehill"):
-        own, bare = (cell_of(results, scene, row.name, SIZE) for row in (DEFAULT, RAW))
-        best = best_peer(results, scene, SIZE, RAW_PEERS)
-        shown += [result for result in (*own, *bare, *best) if result["lpips"] is not None]
-        margin = f"{mean(bare, 'psnr') - mean(best, 'psnr'):+.2f} dB" if bare and best else MISSING
-        lines.append([scene, *(figures(cell, "lpips") for cell in (own, bare, best)), margin])
-    header = ["scene", "nexwarp", "nexwarp, raw", "gsplat, best raw row", "raw less raw"]
     return f"{_table(header, lines)}\n\n{_caption(shown)}"
 
 
