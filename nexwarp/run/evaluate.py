@@ -207,14 +207,15 @@ def _load_lpips(device: torch.device) -> Callable[[torch.Tensor, torch.Tensor], 
     if (file := weights_file()).is_file():
         return load_vgg(file)
     try:
-        import lpips
-    except ImportError as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torchvision deprecates the arguments that lpips passes
+            import lpips
+
+            network = lpips.LPIPS(net="vgg", version="0.1", verbose=False).eval().to(device)
+    except (ImportError, OSError, RuntimeError) as error:  # no package, no download, another torch's torchvision
         raise ImportError(
-            f"{error}, and {file} does not exist: `python -m benchmarks.lpips_weights` writes it"
+            f"{one_line(error)}, and {file} does not exist: `python -m benchmarks.lpips_weights` in a clone writes it"
         ) from None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # torchvision deprecates the arguments that lpips passes
-        network = lpips.LPIPS(net="vgg", version="0.1", verbose=False).eval().to(device)
     return lambda x, y: network(x.permute(2, 0, 1)[None], y.permute(2, 0, 1)[None], normalize=False)
 
 

@@ -5,6 +5,8 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import skimage.metrics
@@ -121,18 +123,32 @@ def no_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path
     metrics._lpips_distance.cache_clear()
 
 
-def test_lpips_is_that_of_its_authors(no_weights: Path) -> None:
-    """The values are those of the package lpips 0.1.4 with these weights, images in [0, 1]."""
+def noisy_and_blurred() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """(40, 48, 3) in [0, 1]: random, the same with noise, and the same blurred."""
     generator = torch.Generator().manual_seed(1)
     image = torch.rand(40, 48, 3, generator=generator)
     noisy = (image + 0.2 * torch.randn(40, 48, 3, generator=generator)).clamp(0, 1)
-    blurred = torch.nn.functional.avg_pool2d(image.permute(2, 0, 1)[None], 5, 1, 2)[0].permute(1, 2, 0)
+    return image, noisy, torch.nn.functional.avg_pool2d(image.permute(2, 0, 1)[None], 5, 1, 2)[0].permute(1, 2, 0)
+
+
+def test_lpips_is_that_of_its_authors(no_weights: Path) -> None:
+    """The values are those of the package lpips 0.1.4 with these weights, images in [0, 1]."""
+    image, noisy, blurred = noisy_and_blurred()
     save_file(vgg_weights(), no_weights)
     distance = load_vgg(no_weights)
     assert distance(image, noisy).item() == pytest.approx(0.0870887, rel=1e-5)
     assert distance(image, blurred).item() == pytest.approx(0.2263193, rel=1e-5)
     eighth = metrics.lpips_vgg(image, noisy)  # of 8-bit images
     assert eighth is not None and abs(eighth - 0.0870887) < 1e-3 and metrics.lpips_vgg(image, image) == 0.0
+
+
+@pytest.mark.skipif(not metrics.weights_file().is_file(), reason="no file of LPIPS's weights")
+def test_lpips_of_its_authors_weights() -> None:
+    """The values are those of the package lpips 0.1.4 with the weights of `benchmarks.lpips_weights`."""
+    image, noisy, blurred = noisy_and_blurred()
+    distance = load_vgg(metrics.weights_file())
+    assert distance(image, noisy).item() == pytest.approx(0.1034049, rel=1e-5)
+    assert distance(image, blurred).item() == pytest.approx(0.5712027, rel=1e-5)
 
 
 def test_lpips_without_weights_is_left_out_with_one_warning(no_weights: Path) -> None:
@@ -142,6 +158,14 @@ def test_lpips_without_weights_is_left_out_with_one_warning(no_weights: Path) ->
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert metrics.lpips_vgg(image, image) is None
+
+
+def test_a_package_lpips_that_does_not_work_is_one_line(no_weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It downloads torchvision's VGG-16, and a torchvision of another torch raises RuntimeError."""
+    error = RuntimeError("operator does not exist\nin C++")
+    monkeypatch.setitem(sys.modules, "lpips", SimpleNamespace(LPIPS=Mock(side_effect=error)))
+    with pytest.raises(SettingError, match=r"^[^\n]*operator does not exist[^\n]*python -m benchmarks.lpips_weights"):
+        metrics.check_metrics(["lpips"], torch.device("cpu"))
 
 
 def test_damaged_lpips_weights_are_named(no_weights: Path) -> None:
