@@ -5,44 +5,22 @@ import dataclasses
 import json
 import sys
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
 from pathlib import Path
 
 from benchmarks import quality
 from benchmarks.quality.documents import MISSING, blocks, fill
 from benchmarks.quality.jobs import FOLDS, ITERATIONS, ROWS, SCENES, SIZE, TABLES, Row, TrainingJob, table_jobs
-from benchmarks.quality.results import drop_unfinished, read_results, result_line
+from benchmarks.quality.results import read_results
 from benchmarks.quality.results import table as results_table
-from benchmarks.quality.run import run_job
+from benchmarks.quality.run import missing_jobs, run_jobs
 from benchmarks.timing import ROOT
 
 
 def train(options: argparse.Namespace) -> int:
     """Run the trainings that the results file lacks."""
     rows = ROWS | own_rows(options.row or ())
-    wanted = wanted_jobs(options, rows)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    if options.out.exists() and drop_unfinished(options.out):
-        print(f"{options.out}: its last line was unfinished and is cut off")
-    done = read_results([options.out]) if options.out.exists() else {}
-    jobs = [job for job in wanted if job not in done]
-    print(f"{len(jobs)} of {len(wanted)} trainings to do", flush=True)
-    failed = 0
-    with ProcessPoolExecutor(options.jobs, get_context("spawn")) as pool:
-        folders = options.pictures, options.models
-        futures = {pool.submit(run_job, job, options.data, rows[job.row], *folders): job for job in jobs}
-        for future in as_completed(futures):
-            job = futures[future]
-            try:
-                result = future.result()
-            except Exception as error:  # one failure must not lose the others' results
-                failed += 1
-                print(f"{job}: {type(error).__name__}: {error}", file=sys.stderr)
-                continue
-            with options.out.open("a") as file:
-                file.write(json.dumps(result | {"jobs": options.jobs}) + "\n")
-            print(result_line(job, result), flush=True)
+    jobs = missing_jobs(wanted_jobs(options, rows), options.out)
+    failed = run_jobs(jobs, rows, options.data, options.out, options.jobs, options.pictures, options.models)
     return 1 if failed else 0
 
 

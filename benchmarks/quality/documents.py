@@ -68,7 +68,7 @@ def readme(results: Results) -> str:
         lines.append(cells)
     columns = ["SSIM", "FLIP", "MB"]
     header = ["scene", "nexwarp: PSNR [dB]", *columns, "gsplat: PSNR [dB]", *columns]
-    return f"{_table(header, lines)}\n\n{_caption(shown)}"
+    return f"{markdown(header, lines)}\n\n{caption(shown)}"
 
 
 def peers(results: Results) -> str:
@@ -81,17 +81,19 @@ def peers(results: Results) -> str:
         margin = f"{mean(own, 'psnr') - mean(best, 'psnr'):+.2f} dB" if own and best else MISSING
         lines.append([scene, f"{size:,}", *(figures(cell) for cell in (own, example, best)), margin])
     header = ["scene", "primitives", "nexwarp", "gsplat as in its example", "gsplat, best row", "nexwarp less best"]
-    return f"{_table(header, lines)}\n\n{_caption(shown)}"
+    return f"{markdown(header, lines)}\n\n{caption(shown)}"
 
 
-def _table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Return a table of cells."""
     head, *rest = (f"| {' | '.join(cells)} |" for cells in (header, *lines))
     return "\n".join([head, "|---" * len(header) + "|", *rest])
 
 
-def _caption(shown: Collection[Mapping[str, Any]]) -> str:
+def caption(shown: Collection[Mapping[str, Any]], command: str = "benchmarks.quality train") -> str:
+    """Return by which command, on what and when results were measured."""
     if not shown:
-        return "*To be measured by* `python -m benchmarks.quality train`."
+        return f"*To be measured by* `python -m {command}`."
     devices = " and ".join(sorted({str(x["device"]) for x in shown}))
     dates = sorted(str(x["date"]) for x in shown)
-    return f"*Measured by* `python -m benchmarks.quality train`, {devices}, {dates[0]} to {dates[-1]}."
+    return f"*Measured by* `python -m {command}`, {devices}, {dates[0]} to {dates[-1]}."

@@ -66,6 +66,7 @@ class TrainingJob:
         seed: of all random choices.
         iterations: training steps.
         downscale: factor by which photos are reduced.
+        images: folder of the photos, in the scene.
     """
 
     scene: str
@@ -75,6 +76,7 @@ class TrainingJob:
     seed: int
     iterations: int
     downscale: int = 1
+    images: str = "images"
 
 
 def table_jobs(table: str, scenes: Iterable[str], seeds: Iterable[int], iterations: int) -> Iterator[TrainingJob]:
@@ -99,7 +101,7 @@ def config_of(job: TrainingJob, row: Row) -> Config:
 
 def scene_of(job: TrainingJob, data: Path) -> Scene:
     """Load the scene of a job from a folder of scenes."""
-    scene = load_scene(data / job.scene, downscale=job.downscale)
+    scene = load_scene(data / job.scene, job.images, job.downscale)
     if not job.variant:
         return scene
     first = FOLDS[job.variant]

@@ -1,17 +1,22 @@
-"""One training of the quality benchmark: train, render the test views, compare them with their photos."""
+"""The trainings of the quality benchmark: train, render the test views, compare them with their photos."""
 
 import gc
+import json
 import statistics
+import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from benchmarks.quality.jobs import Row, TrainingJob, config_of, scene_of
+from benchmarks.quality.results import drop_unfinished, read_results, result_line
 from benchmarks.timing import git_commit
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
@@ -20,6 +25,54 @@ from nexwarp.run.evaluate import METRICS, psnr
 from nexwarp.train.stages import StageRunner, StageStore
 
 RenderImage = Callable[[Camera], torch.Tensor]  # (H, W, 3), not clamped, on any device
+
+
+def missing_jobs(wanted: Sequence[TrainingJob], out: Path) -> list[TrainingJob]:
+    """Return the jobs that a results file lacks, after cutting off a line that a killed program left unfinished."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.exists() and drop_unfinished(out):
+        print(f"{out}: its last line was unfinished and is cut off")
+    done = read_results([out]) if out.exists() else {}
+    jobs = [job for job in wanted if job not in done]
+    print(f"{len(jobs)} of {len(wanted)} trainings to do", flush=True)
+    return jobs
+
+
+def run_jobs(
+    jobs: Sequence[TrainingJob],
+    rows: Mapping[str, Row],
+    data: Path,
+    out: Path,
+    workers: int = 1,
+    pictures: Path | None = None,
+    models: Path | None = None,
+) -> int:
+    """Append the result of each job to a results file; return how many failed.
+
+    Args:
+        jobs: what to train.
+        rows: by name, at least those of the jobs.
+        data: as of `run_job`, as are `pictures` and `models`.
+        out: the results file.
+        workers: trainings at once.
+        pictures: see `data`.
+        models: see `data`.
+    """
+    failed = 0
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        futures = {pool.submit(run_job, job, data, rows[job.row], pictures, models): job for job in jobs}
+        for future in as_completed(futures):
+            job = futures[future]
+            try:
+                result = future.result()
+            except Exception as error:  # one failure must not lose the others' results
+                failed += 1
+                print(f"{job}: {type(error).__name__}: {error}", file=sys.stderr)
+                continue
+            with out.open("a") as file:
+                file.write(json.dumps(result | {"jobs": workers}) + "\n")
+            print(result_line(job, result), flush=True)
+    return failed
 
 
 def run_job(
@@ -36,8 +89,9 @@ def run_job(
 
     Returns:
         A line of the results: the job and its row's settings; means of the metrics over the test views (None where one
-        cannot be had), and by view; `train_psnr` of every 8th training view; `primitives`; `megabytes` of the model
-        file; `seconds` from the loaded scene to the finished model; `peak_mib` of GPU memory; device, date, commit.
+        cannot be had), and by view; `pixels` of the first; `train_psnr` of every 8th training view; `primitives`;
+        `megabytes` of the model file; `seconds` from the loaded scene to the finished model; `peak_mib` of GPU memory;
+        device, date, commit.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     scene = scene_of(job, data)
@@ -50,6 +104,7 @@ def run_job(
     image, facts = train(job, row, scene, device, models)
     seconds = facts.pop("end") - begin
     views = _compare(job, scene, image, pictures)
+    camera = scene.test[0].camera
     known = {name: [x for v in views.values() if (x := v[name]) is not None] for name in METRICS}
     means = {name: statistics.fmean(values) if values else None for name, values in known.items()}
     if device.type == "cuda":
@@ -57,6 +112,7 @@ def run_job(
     return {
         **asdict(job),
         "settings": row.settings,
+        "pixels": f"{camera.width}x{camera.height}",
         **means,
         **facts,
         "seconds": seconds,
