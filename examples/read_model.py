@@ -5,6 +5,7 @@ python examples/read_model.py --run runs/demo --column 48 --row 36
 
 import argparse
 import json
+import lzma
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 
 Tensors = dict[str, np.ndarray]
 
-DTYPES = {"F32": np.float32, "F16": np.float16, "I16": np.int16, "I8": np.int8, "BF16": np.uint16}
+DTYPES = {"F32": np.float32, "F16": np.float16}
 PRIMES = (1, 2654435761, 805459861)
 
 
@@ -24,33 +25,39 @@ def read(path: Path) -> tuple[Tensors, dict[str, Any]]:
     (size,) = struct.unpack("<Q", data[:8])
     header, body = json.loads(data[8 : 8 + size]), data[8 + size :]
     meta = json.loads(header.pop("__metadata__")["nexwarp"])
-    assert meta["format_version"] in (1, 2)
+    assert meta["format_version"] in (1, 3)
     tensors = {}
     for name, entry in header.items():
-        values = np.frombuffer(body[slice(*entry["data_offsets"])], DTYPES[entry["dtype"]])
-        if entry["dtype"] == "BF16":  # the upper half of a float32
-            values = (values.astype(np.uint32) << 16).view(np.float32)
-        tensors[name] = values.reshape(entry["shape"]).astype(np.float64)
+        part = body[slice(*entry["data_offsets"])]
+        if entry["dtype"] == "U8":
+            tensors[name] = unpack(name, part, meta["shapes"][name]).astype(np.float64)
+        else:
+            tensors[name] = np.frombuffer(part, DTYPES[entry["dtype"]]).reshape(entry["shape"]).astype(np.float64)
     return expand(tensors), meta
+
+
+def unpack(name: str, stream: bytes, shape: list[int]) -> np.ndarray:
+    """Numbers of a shape from a stream of a compact file."""
+    count = int(np.prod(shape))
+    digits = np.frombuffer(lzma.LZMADecompressor().decompress(stream), np.uint8)[:, None] >> np.arange(0, 8, 2) & 3
+    planes = digits.reshape(-1, -(-count // 4) * 4)[:, :count].astype(np.int64)  # of digits to base 4
+    folded = 4 ** np.arange(len(planes)) @ planes
+    q = np.where(folded % 2, -(folded + 1) // 2, folded // 2)
+    if name in ("footprints", "far_footprints"):
+        q = (q << 16).astype(np.uint32).view(np.float32)
+    axis = 1 if name == "texture.grid" else 0
+    return np.moveaxis(q.reshape(*shape[:axis], *shape[axis + 1 :], shape[axis]), -1, axis)
 
 
 def expand(tensors: Tensors) -> Tensors:
     """Tensors of a full file from those of a compact one; those of a full file stay."""
-    values = {}
-    for name, q in tensors.items():
-        code = tensors.get(name + ".code")
-        if name.endswith(".code"):
-            continue
-        if code is None:
-            values[name] = q
-        elif name == "texture.grid":
-            values[name] = code[0][:, None, None] * q * abs(q)
-        elif len(code) == 3:
-            values[name] = code[0] + code[1] * np.sinh(code[2] * q)
-        elif name == "surfels.shN":
-            values[name] = code[0] * q * abs(q)
+    values = dict(tensors)
+    for name in [name for name in tensors if name + ".code" in tensors]:
+        q, code = values[name], values.pop(name + ".code")
+        if name == "texture.grid":
+            values[name] = code[:, :1] + q @ code[:, 1:]
         else:
-            values[name] = code[0] + code[1] * q
+            values[name] = code[0] + code[1] * (np.sinh(code[2] * q) if len(code) == 3 else q)
     return values
 
 

@@ -228,8 +228,8 @@ class Export:
     """Export a run to the formats of other programs. docs/outputs.md describes the files.
 
     ply: surfels.ply, all properties of the surfels, and splats.ply, for viewers of 3D Gaussian splatting. spz: the
-    same Gaussians at a tenth of the size (extra `splats`). mesh: triangles with colours. compact: the model in less
-    than half of its size. cameras: for nerfstudio. web: a web page that shows the scene in any browser. glb: for
+    same Gaussians at a tenth of the size (extra `splats`). mesh: triangles with colours. compact: the model in a
+    fifth of its size. cameras: for nerfstudio. web: a web page that shows the scene in any browser. glb: for
     Blender and three.js (extra `glb`).
     """
 

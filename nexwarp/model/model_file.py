@@ -4,7 +4,7 @@ import dataclasses
 import json
 import operator
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import cast
 
@@ -15,6 +15,7 @@ from nexwarp.errors import FormatError, MissingError, check_finite, check_range,
 from nexwarp.io.files import check_tensors_header, one_line, write_atomically
 from nexwarp.io.json_files import Json, parse_json
 from nexwarp.model.bounds import check_bounds, fits_half
+from nexwarp.model.compact import CODE_NAMES, CODED, NOISE, NOISES, TYPES_2, decode, encode, texture_sensitivity
 from nexwarp.model.exposures import SHAPES, Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderOptions, check_removed
@@ -22,13 +23,14 @@ from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NEVER, DetailLimits, NeuralTexture, Texture, TextureShape, registered_texture
 
 FORMAT_VERSION = 1
-COMPACT_VERSION = 2  # of compact files, which older readers cannot read
+COMPACT_VERSION = 3  # of compact files, which older readers cannot read; 2 was theirs before they had streams
 SUFFIX = ".safetensors"
 MODEL_FILE = "model.safetensors"
 KIND = "kind"  # in the metadata of a texture: the name of a registered class
 OWN = "own_texture."  # first part of the names of its tensors
 FRAME = "COLMAP world, cameras x right, y down, z forward"
 DTYPES = ("F16", "F32")
+CODED_SHAPES = "shapes"  # in the metadata of a compact file: of its coded tensors, by name
 
 LARGEST_LENGTH = 1e15
 # Tensor names in the file of DetailLimits' attributes; the format keeps its first names.
@@ -42,32 +44,14 @@ FIXED_NAMES = {
 # Options that files of nexwarp 0.1 do not have.
 LATER_OPTIONS = ("exposure", "detail_limits", "order")
 
-# Compact files, a third as large.
-CODE = ".code"  # end of the name of a tensor that decodes another
-# Names of the coded tensors of each kind. `COMPACT_DTYPES` has their types; other tensors are as in full files.
-CURVED = ("surfels.means",)  # a + b sinh(c q): fine near the scene's middle, with a long reach
-LINEAR = ("surfels.log_scales", "surfels.logit_opacities", "surfels.sh0")  # a + b q
-LINEAR_BYTES = ("surfels.raw_gammas",)  # a + b q
-SQUARED = ("surfels.shN", "texture.grid")  # b q |q|: fine near 0, where most coefficients are
-QUATS = "surfels.raw_quats"  # q, a multiple of the unit quaternion
-ROUNDED = ("footprints", "far_footprints")  # bfloat16: all magnitudes, with three digits
-LARGEST = {torch.int16: 2**15 - 1, torch.int8: 2**7 - 1}
-COMPACT_DTYPES = {
-    **dict.fromkeys((*CURVED, *LINEAR, QUATS), torch.int16),
-    **dict.fromkeys((*LINEAR_BYTES, *SQUARED), torch.int8),
-    **dict.fromkeys(ROUNDED, torch.bfloat16),
-}
-CODE_NAMES = {name + CODE for name in (*CURVED, *LINEAR, *LINEAR_BYTES, *SQUARED)}
-STORED = {torch.int16: "I16", torch.int8: "I8", torch.bfloat16: "BF16"}
-# What logarithms are clamped to. exp(-20) is invisible as an opacity, as its difference from 1 and as a share of the
-# median scale; a gamma of 1 + exp(20) is a hard edge, one of 1 + exp(-20) a Gaussian.
-REACH = 20.0
 
-
-def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = False) -> Path:
+def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool | float = False) -> Path:
     """Write a model, see `Model.save`: surfels, exposures and limits in float32, grid and MLP in half precision."""
     from safetensors.torch import save
 
+    noise = NOISE if compact is True else float(compact)
+    if compact:
+        check_range("compact", noise, *NOISES)
     tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}
     shape = _texture_record(model.texture)
     for name, x in _stored_state(model.texture).items():
@@ -77,7 +61,10 @@ def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = Fa
     if model.exposures is not None:
         tensors |= {f"exposures.{name}": x for name, x in model.exposures.state_dict().items()}
     tensors = {name: x.detach().cpu() for name, x in tensors.items()}
-    tensors = {name: x.contiguous() for name, x in (encode(tensors) if compact else tensors).items()}
+    shapes = {name: list(x.shape) for name, x in tensors.items() if name in CODED}
+    if compact:
+        tensors = encode(tensors, texture_sensitivity(model), noise)
+    tensors = {name: x.contiguous() for name, x in tensors.items()}
     meta = {
         **model.meta,
         **dataclasses.asdict(model.options),
@@ -85,6 +72,7 @@ def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool = Fa
         "format_version": COMPACT_VERSION if compact else FORMAT_VERSION,
         "frame": FRAME,
         "texture": shape,
+        **({CODED_SHAPES: shapes} if compact else {}),
     }
     file = Path(path)
     if file.suffix != SUFFIX or file.is_dir():
@@ -158,7 +146,8 @@ def load(path: str | os.PathLike[str]) -> Model:
         check_tensors_header(path)
         with safe_open(path, "pt") as file:
             meta = _read_metadata(path, (file.metadata() or {}).get("nexwarp"))
-            compact = meta["format_version"] == COMPACT_VERSION
+            version = cast(int, meta["format_version"])
+            compact = version != FORMAT_VERSION
             options = _read_options(meta)
             texture = _empty_texture(meta)
             texture_shapes = {name: list(x.shape) for name, x in _stored_state(texture).items()}
@@ -166,9 +155,11 @@ def load(path: str | os.PathLike[str]) -> Model:
             known = FIXED_NAMES | texture_shapes.keys() | (CODE_NAMES if compact else set())
             names = [name for name in file.keys() if name in known]
             kinds = {name: (file.get_slice(name).get_dtype(), file.get_slice(name).get_shape()) for name in names}
-            _check_kinds(kinds, texture_shapes, compact)
+            coded = {1: {}, 2: TYPES_2, 3: dict.fromkeys(CODED, "U8")}[version]
+            shapes = _read_shapes(meta, kinds) if version == COMPACT_VERSION else None
+            _check_kinds(kinds, texture_shapes, coded, shapes or {})
             tensors = {name: file.get_tensor(name) for name in names}
-        return _make_model(decode(tensors) if compact else tensors, options, texture, meta)
+        return _make_model(decode(tensors, shapes) if compact else tensors, options, texture, meta)
     except FormatError:
         raise
     except (SafetensorError, OSError) as error:
@@ -237,19 +228,35 @@ def _stored_state(texture: Texture | None) -> dict[str, torch.Tensor]:
     return {f"{prefix}{name}": x for name, x in texture.state_dict().items()}
 
 
+def _read_shapes(meta: dict[str, Json], names: Iterable[str]) -> dict[str, list[int]]:
+    """Remove the shapes of a compact file's coded tensors from the metadata and return those of its own."""
+    stored = meta.pop(CODED_SHAPES, None)
+    shapes: dict[str, list[int]] = {}
+    for name in set(CODED).intersection(names):
+        shape = stored.get(name) if isinstance(stored, dict) else None
+        if not isinstance(shape, list) or not shape or any(type(n) is not int or not 0 <= n < 2**31 for n in shape):
+            raise ValueError(f"metadata: expected the shape of {name}, got {shape!r:.60}")
+        shapes[name] = cast(list[int], shape)
+    return shapes
+
+
 def _check_kinds(
-    kinds: Mapping[str, tuple[str, list[int]]], texture_shapes: Mapping[str, list[int]], compact: bool
+    kinds: Mapping[str, tuple[str, list[int]]],
+    texture_shapes: Mapping[str, list[int]],
+    coded: Mapping[str, str],
+    coded_shapes: Mapping[str, list[int]],
 ) -> None:
     """Check the dtypes of all tensors and the shapes of the texture's before anything is allocated."""
-    for name, (dtype, shape) in kinds.items():
-        coded = COMPACT_DTYPES.get(name) if compact else None
-        if coded is not None and dtype != STORED[coded]:
-            raise ValueError(f"{name}: expected {STORED[coded]}, got {dtype}")
-        if coded is None and dtype not in DTYPES:
+    for name, (dtype, stored) in kinds.items():
+        if name in coded and dtype != coded[name]:
+            raise ValueError(f"{name}: expected {coded[name]}, got {dtype}")
+        if name not in coded and dtype not in DTYPES:
             raise ValueError(f"{name}: expected float16 or float32, got {dtype}")
-        expected = texture_shapes.get(name, shape)
-        if expected != shape:
-            raise ValueError(f"{name}: expected shape {expected}, got {shape}")
+        if name in coded_shapes and len(stored) != 1:
+            raise ValueError(f"{name}: expected a stream of bytes, got shape {stored}")
+        shape = coded_shapes.get(name, stored)
+        if texture_shapes.get(name, shape) != shape:
+            raise ValueError(f"{name}: expected shape {texture_shapes[name]}, got {shape}")
     missing = sorted(texture_shapes.keys() - kinds.keys())
     if missing:
         raise ValueError(f"expected the tensor {missing[0]}, found none")
@@ -284,85 +291,3 @@ def _make_model(
 def _part(tensors: Mapping[str, torch.Tensor], prefix: str) -> dict[str, torch.Tensor]:
     """Return the tensors with a prefix in their names, as float32, by the names without it."""
     return {name[len(prefix) :]: x.float() for name, x in tensors.items() if name.startswith(prefix)}
-
-
-def _rows(name: str) -> int:
-    """Return how many numbers decode a column."""
-    return 3 if name in CURVED else 1 if name in SQUARED else 2
-
-
-def encode(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return the tensors of a compact file, from those of a full one on the CPU."""
-    coded: dict[str, torch.Tensor] = {}
-    for name, tensor in tensors.items():
-        if name not in COMPACT_DTYPES:
-            coded[name] = tensor
-            continue
-        kind, values = COMPACT_DTYPES[name], tensor.double()
-        if name in ROUNDED:
-            # Rounded towards 0: the largest value is a bound.
-            coded[name] = values.clamp(max=NEVER).float().view(torch.int32).bitwise_and(-65536).view(torch.float32)
-            coded[name] = coded[name].to(kind)
-        elif name == QUATS:
-            largest = values.abs().amax(1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
-            coded[name] = (values / largest * LARGEST[kind]).round().to(kind)
-        else:
-            whole, code = _encoded(name, values, LARGEST[kind])
-            coded[name], coded[name + CODE] = whole.to(kind), code
-    return coded
-
-
-def _encoded(name: str, values: torch.Tensor, largest: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return whole numbers of at most `largest`, and the numbers (R, columns) that decode each column."""
-    if len(values) == 0:
-        return values, torch.zeros(_rows(name), *_columns(name, values.shape))
-    if name in SQUARED:
-        axes = tuple(range(1, values.ndim)) if name == "texture.grid" else (0,)
-        scale = (values.abs().amax(axes, keepdim=True) / largest**2).float().double()
-        roots = (values.abs() / scale.clamp_min(torch.finfo(torch.float32).tiny)).sqrt().round().clamp(max=largest)
-        return roots * values.sign(), scale.float().reshape(1, *_columns(name, values.shape))
-    if name in CURVED:
-        middle = values.median(0).values.float().double()
-        spread = (values - middle).abs().median(0).values.clamp_min(1e-12).float().double()
-        bent = torch.asinh((values - middle) / spread)
-        step = (bent.abs().amax(0) / largest).clamp_min(1e-12).float().double()
-        return (bent / step).round().clamp(-largest, largest), torch.stack([middle, spread, step]).float()
-    if name == "surfels.log_scales":  # their unit is that of the scene
-        middle = values.median(0).values
-        values = values.clamp(middle - REACH, middle + REACH)
-    elif name in ("surfels.logit_opacities", "surfels.raw_gammas"):  # the median may be at an end: most opacities 1
-        values = values.clamp(-REACH, REACH)
-    low, high = values.amin(0), values.amax(0)
-    middle = ((low + high) / 2).float().double()
-    step = torch.maximum(high - middle, middle - low).div(largest).clamp_min(1e-12).float().double()
-    return ((values - middle) / step).round().clamp(-largest, largest), torch.stack([middle, step]).float()
-
-
-def decode(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return the tensors of a full file, from those of a compact one; ValueError where a code does not fit."""
-    full = {name: x for name, x in tensors.items() if not name.endswith(CODE)}
-    for name, tensor in full.items():
-        if name in ROUNDED or name == QUATS:
-            full[name] = tensor.float()
-        elif name in COMPACT_DTYPES:
-            if name + CODE not in tensors:
-                raise ValueError(f"expected the tensor {name + CODE}, found none")
-            code = tensors[name + CODE]
-            check_tensors({name + CODE: (code, (_rows(name), *_columns(name, tensor.shape)))}, dtype=torch.float32)
-            full[name] = _decoded(name, tensor.double(), code.double()).float()
-    return full
-
-
-def _columns(name: str, shape: torch.Size) -> tuple[int, ...]:
-    """Return the shape of what is coded alike: a level of the grid, a column of the others."""
-    return tuple(shape[:1] if name == "texture.grid" else shape[1:])
-
-
-def _decoded(name: str, whole: torch.Tensor, code: torch.Tensor) -> torch.Tensor:
-    if name == "texture.grid":
-        return code[0][:, None, None] * whole * whole.abs()
-    if name in SQUARED:
-        return code[0] * whole * whole.abs()
-    if name in CURVED:
-        return code[0] + code[1] * torch.sinh(code[2] * whole)
-    return code[0] + code[1] * whole

@@ -23,6 +23,7 @@ from nexwarp.export.mesh import Progress, extract_mesh, save_mesh
 from nexwarp.export.splats import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_splats_spz, save_surfels_ply
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import JsonObject, write_json
+from nexwarp.model.compact import NOISE, NOISES
 from nexwarp.model.model_file import save_model
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, ORIGIN_FILE, TRAIN, OpenedModel
 
@@ -40,6 +41,8 @@ class ExportOrder:
     """Output folder; with --format web also NAME.html, for one file with everything."""
     quality: Annotated[str, arg(metavar="{quantised,full}")] = "quantised"
     """Of --format web: quantised files are a fifth to a half as large."""
+    noise: Annotated[float, arg(metavar="X")] = NOISE
+    """Of compact: noise that its pictures may have, of 1; files with more are smaller."""
     max_extent: Annotated[float, arg(metavar="X")] = MAX_EXTENT
     """Of splats: split surfels larger than this share of their distance to the nearest camera; inf splits none."""
     voxel: Annotated[
@@ -53,6 +56,8 @@ class ExportOrder:
         """Raise SettingError unless the options fit together."""
         if not self.max_extent > 0:
             raise SettingError(f"--max-extent: expected more than 0, got {self.max_extent:g}")
+        if not NOISES[0] <= self.noise <= NOISES[1]:
+            raise SettingError(f"--noise: expected {NOISES[0]:g} to {NOISES[1]:g}, got {self.noise:g}")
         if self.format not in EXPORTS:
             raise SettingError(f"--format: expected one of {', '.join(EXPORTS)}, got {self.format!r}")
         if self.format != "mesh" and (self.voxel is not None or self.far is not None):
@@ -105,7 +110,7 @@ def _export(
         model = opened.model.to(device)
         save_mesh(files[0], extract_mesh(model, [*trained.values()], voxel=order.voxel, far=order.far, observe=observe))
     elif order.format == "compact":
-        save_model(files[0], opened.model, compact=True)
+        save_model(files[0], opened.model, compact=order.noise)
     elif order.format == "glb":
         if not views:
             raise RunError(f"{opened.path}: --format glb: expected the run's {CAMERAS_FILE}, found none")

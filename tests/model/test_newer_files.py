@@ -130,7 +130,7 @@ def write_version(kind: str, folder: Path, version: object) -> tuple[Path, Calla
 
 @pytest.mark.parametrize("kind", ["model", "config", "metrics", "cameras", "checkpoint"])
 def test_only_known_versions_are_read(tmp_path: Path, kind: str) -> None:
-    known = "1 to 2" if kind == "model" else "1"
+    known = "1 to 3" if kind == "model" else "1"
     for number, version in enumerate(WRONG_VERSIONS):
         file, read = write_version(kind, tmp_path / str(number), version)
         refused(ValueError, read, names=file, match=f"expected format version {known}, got {version!r}")

@@ -103,7 +103,7 @@ MUTATIONS = [
     Mutation("io/files.py", "            sync(temporary)\n", "            pass\n", "tests/robustness/test_power_cut.py -k loses"),
     Mutation("io/files.py", "os.replace(temporary, path)", "path.write_bytes(temporary.read_bytes())", "tests/robustness/test_faults.py -k 'eval or cameras'"),
     Mutation("io/ply.py", 'newbyteorder("<")', 'newbyteorder(">")', "tests/export/test_export.py"),
-    Mutation("model/model_file.py", "bitwise_and(-65536)", "bitwise_and(-16777216)", "tests/model/test_compact_files.py"),
+    Mutation("model/compact.py", "root = vectors * values", "root = vectors / values", "tests/model/test_compact_files.py"),
     Mutation("run/evaluate.py", "mean(dtype=torch.float64).item()", "mean(dtype=torch.float64).item() * 1.001", "tests/run/test_metrics.py"),
     Mutation("run/folder.py", "WITHOUT_LOCKS = (errno.ENOLCK, ", "WITHOUT_LOCKS = (errno.EAGAIN, ", "tests/run/test_run_lock.py"),
 ]  # fmt: skip
