@@ -1,5 +1,6 @@
 """Compact model files: small, close to the model, and refused with one line where they are damaged."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -250,3 +251,18 @@ def test_export_writes_a_compact_file(tmp_path: Path, capsys: pytest.CaptureFixt
     assert capsys.readouterr().out.split() == [str(file)]
     assert file.stat().st_size < (run / MODEL_FILE).stat().st_size  # of few surfels, so most of it is header
     assert len(nw.load(file).surfels) == len(nw.load(run).surfels)
+
+
+def test_exports_of_worse_models_are_smaller(tmp_path: Path) -> None:
+    """Noise that adds 0.03 dB to large errors would add more to small ones."""
+    run = Path(shutil.copytree(Path(__file__).parents[1] / "old_files" / "0.2.0-69de7c9", tmp_path / "run"))
+
+    def exported(metrics: str, *options: str) -> bytes:
+        (run / "metrics.json").write_text(metrics)
+        assert cli.main(["export", str(run), "--format", "compact", "--out", str(tmp_path), *options]) == 0
+        return (tmp_path / "compact.safetensors").read_bytes()
+
+    usual = nw.load(run).save(tmp_path / "usual.safetensors", compact=True).read_bytes()
+    sizes = [len(exported(f'{{"psnr": {psnr}}}')) for psnr in (20, 30, 40)]
+    assert sizes == sorted(sizes) and sizes[0] < sizes[2]
+    assert exported('{"psnr": null}') == exported('{"psnr": 20}', "--noise", "0.002") == usual
