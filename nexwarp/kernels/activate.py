@@ -64,27 +64,6 @@ def unit_dot(quat: Vec4, grad: Vec4):
 
 
 @functools.cache
-def unit_kernels(real: type) -> SimpleNamespace:
-    """Make the kernels of quaternion / length alone."""
-    vec4 = types(real).vec4
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def unit_quats(first: wp.int32, quats: wp.array(dtype=vec4), units: wp.array(dtype=vec4)):
-        i = first + wp.tid()
-        units[i] = unit(quats[i])
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def unit_quats_backward(
-        first: wp.int32, quats: wp.array(dtype=vec4), grads: wp.array(dtype=vec4), grad_quats: wp.array(dtype=vec4)
-    ):
-        i = first + wp.tid()
-        grad_quat, _grad = wp.grad(unit_dot)(quats[i], grads[i])
-        grad_quats[i] = grad_quat
-
-    return SimpleNamespace(forward=unit_quats, backward=unit_quats_backward)
-
-
-@functools.cache
 def activate_kernels(real: type) -> SimpleNamespace:
     """Make the kernels of quaternion / length, exp, sigmoid and 1 + exp."""
     t = types(real)

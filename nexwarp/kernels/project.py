@@ -11,6 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from nexwarp.kernels.activate import unit
 from nexwarp.kernels.shape import exponent_limit
 from nexwarp.kernels.surfel import axes, rotate, translation
 from nexwarp.kernels.types import Mat44, Vec2, Vec3, Vec4, types
@@ -23,7 +24,7 @@ SMALLEST_SCALE = wp.constant(wp.float64(1e-20))
 @wp.func
 def placed(mean: Vec3, quat: Vec4, scale: Vec2, viewmat: Mat44):
     """(a, b, n, c) of the surfel's record, see `surfel`."""
-    x, y, z = axes(quat)
+    x, y, z = axes(unit(quat))
     center = rotate(viewmat, mean) + translation(viewmat)
     v1 = rotate(viewmat, x)
     v2 = rotate(viewmat, y)

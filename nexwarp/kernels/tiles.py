@@ -13,6 +13,7 @@ from typing import Any
 
 import warp as wp
 
+from nexwarp.kernels.activate import unit
 from nexwarp.kernels.shape import reach
 from nexwarp.kernels.surfel import axes, intrinsics_of, rotate, translation
 from nexwarp.kernels.types import Real, Vec3, Vec4, types
@@ -136,7 +137,7 @@ def tile_polygon_kernel(real: type) -> wp.Kernel:
             return
         viewmat = viewmats[0]
         intrinsics = intrinsics_of(Ks[0])
-        x_axis, y_axis, _normal = axes(quats[i])
+        x_axis, y_axis, _normal = axes(unit(quats[i]))
         center = rotate(viewmat, means[i]) + translation(viewmat)
         v1 = rotate(viewmat, x_axis) * (scales[i][0] * extent[0])
         v2 = rotate(viewmat, y_axis) * (scales[i][1] * extent[1])

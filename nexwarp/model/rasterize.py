@@ -15,7 +15,6 @@ from nexwarp.model.options import Color, RenderOptions, color_tensor
 from nexwarp.model.render import check_camera, memory_error, pinhole_of, prepare_device
 from nexwarp.model.surfels import Activated, check_coefficients
 from nexwarp.model.texture import Hits
-from nexwarp.ops.activate import unit_quats
 from nexwarp.ops.collect import CHANNELS
 
 Values = torch.Tensor | npt.ArrayLike  # arrays and lists become tensors of the camera's dtype, on its device
@@ -131,7 +130,6 @@ def _rasterize(
 ) -> Hits:
     """Draw one camera: one walk blends 3 + 16 channels, and a further one each further 16."""
     with torch.autocast(shape.means.device.type, enabled=False):
-        shape = shape._replace(quats=unit_quats(shape.quats))
         if colors.ndim == 3:
             colors = ops.plain_colors(colors, shape.means, camera.position, 3)
         channels, pinhole = colors.shape[1], pinhole_of(camera, shape.means)

@@ -3,7 +3,7 @@
 import torch
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.activate import activate_kernels, unit_kernels
+from nexwarp.kernels.activate import activate_kernels
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import Argument, Context, array, first_derivative, launch, real_of, struct
 
@@ -72,27 +72,3 @@ class _Activate(torch.autograd.Function):
         kernel = activate_kernels(real_of(raw[0])).backward
         launch(raw[0], kernel, len(raw[0]), inputs, [parameters(*grad_raw)])
         return tuple(x if need else None for x, need in zip(grad_raw, ctx.needs_input_grad, strict=True))
-
-
-def unit_quats(quats: torch.Tensor) -> torch.Tensor:
-    """Return quaternions (N, 4) over their lengths, as `activate` does: one kernel where torch launches many."""
-    return _UnitQuats.apply(quats)
-
-
-class _UnitQuats(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Context, quats: torch.Tensor) -> torch.Tensor:
-        quats, vec4 = quats.contiguous(), types(real_of(quats)).vec4
-        units = torch.empty_like(quats)
-        launch(quats, unit_kernels(real_of(quats)).forward, len(quats), [array(quats, vec4)], [array(units, vec4)])
-        ctx.save_for_backward(quats)
-        return units
-
-    @staticmethod
-    @first_derivative
-    def backward(ctx: Context, grads: torch.Tensor) -> tuple[torch.Tensor]:
-        (quats,) = ctx.saved_tensors
-        grad_quats, vec4 = torch.empty_like(quats), types(real_of(quats)).vec4
-        inputs = [array(quats, vec4), array(grads.contiguous(), vec4)]
-        launch(quats, unit_kernels(real_of(quats)).backward, len(quats), inputs, [array(grad_quats, vec4)])
-        return (grad_quats,)

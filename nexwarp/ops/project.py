@@ -54,7 +54,7 @@ def project(
 
     Args:
         means: (N, 3) world.
-        quats: (N, 4) unit, wxyz, surfel to world.
+        quats: (N, 4) wxyz, surfel to world, of any length; one shorter than 1e-12 is divided by 1e-12.
         scales: (N, 2) world units.
         opacities: (N,).
         gammas: (N, 2).

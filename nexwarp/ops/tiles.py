@@ -93,7 +93,7 @@ def intersect_tiles(
     """List, for each tile, the surfels whose support touches it.
 
     Args:
-        surfels: means (N, 3), world; quats (N, 4), unit, wxyz, surfel to world; scales (N, 2), world units;
+        surfels: means (N, 3), world; quats (N, 4), wxyz, surfel to world; scales (N, 2), world units;
             opacities (N,); gammas (N, 2).
         projection: of the same surfels.
         viewmat: (4, 4) world to camera.

@@ -5,7 +5,6 @@ import torch
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.ops.activate import unit_quats
 from tests.narrowing import total
 from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close, assert_finite
@@ -99,13 +98,18 @@ def test_extremes_are_finite_and_what_torch_gives(dtype: torch.dtype, device: to
         assert_close((ours * lengths)[row], (torchs * lengths)[row], kind="gradient", name=f"quaternion {row}")
 
 
-def test_unit_quaternions_alone(device: torch.device) -> None:
-    raw = make_raw(100, torch.float64, device).raw_quats
-    expected = torch.nn.functional.normalize(raw, dim=-1)
-    signal = torch.randn_like(raw)
-    actual = unit_quats(raw)
-    assert_exact(actual, expected, "value", "quats")
-    grads = (torch.autograd.grad(x, raw, signal)[0] for x in (actual, expected))
+def test_projection_takes_quaternions_of_any_length(device: torch.device) -> None:
+    """Records and gradients are those of quaternions that torch has normalised."""
+    scene = random_scene(100, dtype=torch.float64, device=device)
+    quats = (scene["quats"] * torch.linspace(0.01, 100, 100, device=device)[:, None]).requires_grad_()
+    rest = [scene[name] for name in ("scales", "opacities", "gammas")] + [scene["means"]]
+    actual, expected = (
+        ops.project(scene["means"], x, *rest, scene["viewmat"]).records
+        for x in (quats, torch.nn.functional.normalize(quats, dim=-1))
+    )
+    assert_close(actual, expected, kind="value", name="records")
+    signal = torch.randn_like(actual)
+    grads = (torch.autograd.grad(x, quats, signal)[0] * quats.norm(dim=1, keepdim=True) for x in (actual, expected))
     assert_close(*grads, kind="gradient", name="quats")
 
 
