@@ -16,10 +16,10 @@ from rich.console import Console
 from nexwarp.cli import display
 from nexwarp.cli.options import Device_, Flag_, Host_, Port_, Preset_, Run_, check_max_hits, option, pick_device
 from nexwarp.data import View
-from nexwarp.data.scene import SceneSource
+from nexwarp.data.scene import DEMO, SceneSource, scene_kinds
 from nexwarp.data.sfm import SfmOptions, process
-from nexwarp.data.sfm.photos import FILMS
-from nexwarp.data.sfm.process import FRAMES, REPORT_FILE, video_identity
+from nexwarp.data.sfm.photos import CONVERTIBLE, FILMS, SUFFIXES
+from nexwarp.data.sfm.process import FRAMES, REPORT_FILE, source_identity
 from nexwarp.errors import MissingError, RunError, SceneError
 from nexwarp.io.json_files import READ_ERRORS, Json, read_object, write_json
 from nexwarp.model.model import Model
@@ -79,35 +79,42 @@ class Process:
             console.print(line, soft_wrap=True, markup=False, highlight=False)
 
 
-def is_video(path: str) -> bool:
-    """Whether a path is the file of a video, by its suffix."""
-    return Path(path).suffix.lower() in FILMS and not Path(path).is_dir()
+def needs_cameras(source: SceneSource) -> bool:
+    """Whether a source is a video, by its suffix, or a folder that has photos in it and no scene."""
+    path = Path(source.path)
+    if not path.is_dir():
+        return path.suffix.lower() in FILMS
+    if source.path == DEMO or source.format or source.images != SceneSource.images or scene_kinds(path):
+        return False
+    return any(file.suffix.lower() in (*SUFFIXES, *CONVERTIBLE) for file in path.iterdir())
 
 
-def scene_folder_of(video: Path) -> Path:
-    """Return the folder of the scene that `nexwarp train` makes of a video."""
-    return Path("scenes") / video.stem
+def scene_folder_of(source: Path) -> Path:
+    """Return the folder of the scene that `nexwarp train` makes of a video or of photos."""
+    return Path("scenes") / (source.absolute().name if source.is_dir() else source.stem)
 
 
-def scene_of_video(video: Path, console: Console) -> None:
-    """Make the scene of a video, unless that was done before; RunError if its folder holds something else."""
-    if not video.is_file():
-        raise FileNotFoundError(f"{video}: no such file, expected a video")
-    scene = scene_folder_of(video)
+def make_scene(source: Path, console: Console) -> None:
+    """Make the scene of a video or photos, unless that was done before; RunError if its folder has something else."""
+    if not source.exists():
+        raise FileNotFoundError(f"{source}: no such file, expected a video")
+    scene, kind = scene_folder_of(source), "folder" if source.is_dir() else "video"
     if (scene / REPORT_FILE).is_file():
         try:
-            made_of = read_object(scene / REPORT_FILE).get("video")
+            made_of = read_object(scene / REPORT_FILE).get(kind)
         except READ_ERRORS:
             made_of = None
-        if made_of == video_identity(video):
-            console.print(f"{video}: the scene {scene} was made of it before", soft_wrap=True, highlight=False)
+        if made_of == source_identity(source):
+            console.print(f"{source}: the scene {scene} was made of it before", soft_wrap=True, highlight=False)
             return
     if scene.exists():
         raise RunError(
-            f"{scene}: expected no folder of that name, or a scene made of {video}; "
-            f"make a scene with nexwarp process {video} SCENE, and train that"
+            f"{scene}: expected no folder of that name, or a scene made of {source} as it is; "
+            f"make a scene with nexwarp process {source} SCENE, and train that"
         )
-    Process(video, scene).make(console)
+    what = "photos" if source.is_dir() else "a video"
+    console.print(f"{source}: {what} without cameras, so {scene} is made first", soft_wrap=True, highlight=False)
+    Process(source, scene).make(console)
 
 
 @dataclass

@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from nexwarp.cli import display
-from nexwarp.cli.commands import is_video, print_url, scene_folder_of, scene_of_video, show_until_interrupted
+from nexwarp.cli.commands import make_scene, needs_cameras, print_url, scene_folder_of, show_until_interrupted
 from nexwarp.cli.display import device_name
 from nexwarp.cli.options import Device_, Flag_, Host_, Port_, Preset_, check_max_hits, joined_ranks, option
 from nexwarp.cli.session import Session
@@ -111,8 +111,8 @@ class Train:
         return self.gpus
 
     def _train(self, ranks: Ranks, console: Console) -> None:
-        if is_video(self.scene.path):
-            self.scene = dataclasses.replace(self.scene, path=self._scene_of_video(ranks, console))
+        if needs_cameras(self.scene):
+            self.scene = dataclasses.replace(self.scene, path=self._make_scene(ranks, console))
         run = self.run or Path("runs") / self.scene.name
         with ExitStack() as claim:
             record, resume = self._plan(run, ranks, claim, console)
@@ -266,15 +266,15 @@ class Train:
 
             check_server(self.host, self.port)
 
-    def _scene_of_video(self, ranks: Ranks, console: Console) -> str:
-        """Return the scene of a video, which rank 0 makes unless the run folder would be refused later."""
+    def _make_scene(self, ranks: Ranks, console: Console) -> str:
+        """Return the scene of a video or photos, which rank 0 makes unless the run folder would be refused later."""
         scene = scene_folder_of(Path(self.scene.path))
         if ranks.first:
             self._check()
             run = self.run or Path("runs") / scene.name
             resume = prepare_run(run, SceneSource(str(scene)), resume=self.resume, overwrite=self.overwrite)
             self._record(run, resume, ranks)
-            scene_of_video(Path(self.scene.path), console)
+            make_scene(Path(self.scene.path), console)
         ranks.barrier()
         return str(scene)
 

@@ -68,7 +68,7 @@ class SceneSource:
     """Where a scene lies, and how to read it: the options of `load_scene`."""
 
     path: Annotated[str, Positional, arg(metavar="SCENE")]
-    """Folder of a COLMAP, nerfstudio or Blender scene, `demo`, or a video (docs/scenes.md)."""
+    """Folder of a COLMAP, nerfstudio or Blender scene, `demo`, a video, or a folder of photos (docs/scenes.md)."""
     images: Annotated[str, arg(metavar="FOLDER")] = "images"
     """Folder of the photos, in SCENE."""
     downscale: Annotated[int, arg(metavar="N")] = 1
@@ -360,15 +360,20 @@ def _parse_color(color: str | Sequence[float] | None) -> tuple[float, float, flo
     return values
 
 
+def scene_kinds(path: Path) -> list[str]:
+    """Return which of `READERS` find a scene in a folder."""
+    kinds = ["colmap"] if has_model(path) else []
+    kinds += ["nerfstudio"] if (path / NERFSTUDIO_FILE).is_file() else []
+    return kinds + (["blender"] if (path / BLENDER_FILES["train"]).is_file() else [])
+
+
 def find_format(path: Path, format: str | None = None) -> str:
     """Tell which kind of scene a folder holds, exactly one of `READERS`, or check `format`."""
     if format is not None:
         if format not in READERS:
             raise ValueError(f"format: expected one of {', '.join(READERS)}, got {format!r}")
         return format
-    kinds = ["colmap"] if has_model(path) else []
-    kinds += ["nerfstudio"] if (path / NERFSTUDIO_FILE).is_file() else []
-    kinds += ["blender"] if (path / BLENDER_FILES["train"]).is_file() else []
+    kinds = scene_kinds(path)
     if len(kinds) > 1:
         raise ValueError(
             f"{path}: expected one kind of scene, got {' and '.join(READERS[kind] for kind in kinds)}; "
@@ -378,7 +383,7 @@ def find_format(path: Path, format: str | None = None) -> str:
         raise FileNotFoundError(
             f"{path}: no scene found, expected a COLMAP model (cameras, images and points3D, .bin or .txt, in "
             f"sparse/0, in sparse or in the folder itself), {NERFSTUDIO_FILE} of nerfstudio, or "
-            f"{BLENDER_FILES['train']} of Blender"
+            f"{BLENDER_FILES['train']} of Blender; nexwarp process makes a scene of photos alone"
         )
     return kinds[0]
 

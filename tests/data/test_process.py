@@ -13,8 +13,9 @@ import torch
 from scipy.ndimage import gaussian_filter, shift
 
 from nexwarp.cli import main as cli
-from nexwarp.cli.commands import is_video
+from nexwarp.cli.commands import needs_cameras
 from nexwarp.data import load_scene
+from nexwarp.data.scene import SceneSource
 from nexwarp.data.sfm.frames import motion, sharpness, take_frames
 from nexwarp.data.sfm.photos import judged, read_photos
 from nexwarp.data.sfm.process import process
@@ -156,8 +157,8 @@ def test_a_missing_package_is_one_line(
 
 def test_videos_are_known_by_their_suffix(tmp_path: Path) -> None:
     (tmp_path / "scene.mp4").mkdir()
-    assert is_video("a/walk.MOV") and not is_video("a/walk") and not is_video(str(tmp_path / "scene.mp4"))
-    assert not is_video("demo")
+    assert needs_cameras(SceneSource("a/walk.MOV"))
+    assert not any(needs_cameras(SceneSource(path)) for path in ("a/walk", str(tmp_path / "scene.mp4"), "demo"))
 
 
 @pytest.mark.slow

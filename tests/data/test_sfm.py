@@ -26,7 +26,8 @@ from nexwarp.data.sfm.photos import affordable_threads, list_photos
 from nexwarp.data.sfm.report import Overlaps, advise, components, left_out
 from nexwarp.data.sfm.stages import exhaustive_pairs, sequential_pairs
 from nexwarp.errors import OutOfMemoryError, SceneError, StorageError
-from tests.cli.support import refused, snapshot
+from nexwarp.train import recipe
+from tests.cli.support import SMALL, refused, snapshot
 from tests.subprocesses import python_path
 
 ROOT = Path(__file__).parents[2]
@@ -161,6 +162,25 @@ def test_the_same_photos_give_the_same_bits(made, photos, tmp_path):
     ours, theirs = snapshot(tmp_path / "again"), snapshot(made)
     del ours["sfm.json"], theirs["sfm.json"]  # they hold seconds
     assert ours == theirs
+
+
+def test_photos_without_a_scene_are_processed_and_trained(photos, tmp_path, monkeypatch, capsys):
+    """Once: a second training takes the scene that is there, unless the photos have changed since."""
+    own = Path(shutil.copytree(photos, tmp_path / "yard"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(recipe.PRESETS, "default", SMALL)
+    few = ["--iterations", "1", "--max-surfels", "100", "--device", "cpu"]
+    assert cli.main(["train", "yard", *few]) == 0
+    scene = Path("scenes", "yard")
+    assert f"yard: photos without cameras, so {scene} is made first\n" in capsys.readouterr().out
+    assert (scene / "sfm.json").is_file() and (tmp_path / "runs" / "yard" / "metrics.json").is_file()
+    before = snapshot(scene)
+    assert cli.main(["train", str(own), "--run", "second", *few]) == 0
+    assert f"the scene {scene} was made of it before\n" in capsys.readouterr().out and snapshot(scene) == before
+    (own / "view 5.png").unlink()
+    refused(capsys, ["train", "yard", "--run", "third", *few], f"{scene}: expected", "a scene made of yard as it is")
+    # Where a scene is asked for, by an option that only scenes have, photos alone are none.
+    refused(capsys, ["train", "yard", "--run", "third", *few, "--format", "colmap"], "yard: no COLMAP model found")
 
 
 def test_distortion_is_found_and_taken_out(arc, tmp_path):

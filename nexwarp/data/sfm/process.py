@@ -62,7 +62,7 @@ class Order:
     folder: str  # to work in; the scene is made in its subfolder scene/
     frames: int  # number of parts of a video
     options: JsonObject  # of `SfmOptions`
-    video: JsonObject | None  # the video's identity; None for photos
+    identity: JsonObject  # of the source
 
 
 def process(
@@ -117,7 +117,7 @@ def process(
     inputs = [source / name for name in names] or [source]
     before = {file: _identity(file) for file in inputs}
     with _claimed(scene) as folder:
-        identity = video_identity(source) if video else None
+        identity = source_identity(source)
         order = Order(str(source.absolute()), names, str(folder), frames, asdict(options), identity)
         try:
             report = _in_child(order, scene, observe)
@@ -141,10 +141,13 @@ def reconstruct(
     return process(photos, scene, options=options, overwrite=overwrite, observe=observe)
 
 
-def video_identity(path: Path) -> dict[str, Json]:
-    """Return name, size and time of a video, by which a scene tells what it was made of."""
-    status = path.stat()
-    return {"name": path.name, "bytes": status.st_size, "modified": status.st_mtime}
+def source_identity(source: Path) -> dict[str, Json]:
+    """Return name, size and time of a video, or of all photos of a folder, by which a scene tells its source."""
+    photos = [source / name for name in list_photos(source)] if source.is_dir() else []
+    states = [file.stat() for file in photos or [source]]
+    size, modified = sum(state.st_size for state in states), max(state.st_mtime for state in states)
+    count: dict[str, Json] = {"photos": len(photos)} if photos else {}
+    return {"name": source.absolute().name, **count, "bytes": size, "modified": modified}
 
 
 def file_facts(file: Path) -> list[Json]:
@@ -284,7 +287,7 @@ def _make(order: Order, observe: Observer) -> dict[str, object]:
     source, folder = Path(order.source), Path(order.folder)
     options = SfmOptions(**order.options)  # type: ignore[arg-type]  # checked before
     names, choice = order.photos, None
-    if order.video is not None:
+    if not order.photos:
         photos = folder / "frames"
         photos.mkdir()
         choice = take_frames(source, order.frames, photos, observe)
@@ -297,7 +300,7 @@ def _make(order: Order, observe: Observer) -> dict[str, object]:
     scene = folder / "scene"
     content = asdict(report)
     files = {file.relative_to(scene).as_posix(): file_facts(file) for file in scene.rglob("*") if file.is_file()}
-    extra = {"options": asdict(options), "video": order.video, "files": files}
+    extra = {"options": asdict(options), "folder" if order.photos else "video": order.identity, "files": files}
     write_json(scene / REPORT_FILE, content | extra)
     return content
 
