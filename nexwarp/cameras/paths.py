@@ -13,7 +13,9 @@ from nexwarp.errors import check_range
 DEGENERATE = 1e-6  # below this share of a comparable length, a length counts as zero
 ONE_WAY = 0.5  # smallest length of the mean viewing direction for a spiral
 SPREAD = 0.9  # share of the cameras that a spiral spans along each axis
-FRAMES_PER_KEY = 10
+WINDOW = 2.0  # standard deviation, in cameras, of the window of `interpolate`
+COMMON = 0.9  # least share of the cameras that see the subject of an ellipse
+WIDEST_GAP = math.radians(120.0)  # between neighbours around that subject
 
 LEAST_UP = 1e-3  # length of a mean of upward directions that counts as one
 MEAN_UP_SHARE = 0.01  # weight of that mean beside the right axes
@@ -92,12 +94,11 @@ def spiral(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     return [_looking(cameras[0], place, target if share == 1.0 else place + forward, up) for place in places]
 
 
-def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = None) -> list[Camera]:
-    """Return `count` cameras on a smooth path from the first to the last of the given ones.
+def through(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
+    """Return `count` cameras on a smooth path that passes through all of the given ones, from the first to the last.
 
-    The path passes through key cameras: at most `keys` (None is one for every 10 of `count`), at even spacing in the
-    list, the first and last included. The time between two keys is proportional to their distance and rotation. Centres
-    follow a cubic spline, rotations one of continuous angular acceleration. All else is that of the first camera.
+    The time between two cameras is proportional to their distance and rotation. Centres follow a cubic spline,
+    rotations one of continuous angular acceleration. All else is that of the first camera.
 
     Raises:
         ValueError: fewer than two distinct cameras, or `count` < 1.
@@ -106,25 +107,71 @@ def interpolate(cameras: Sequence[Camera], count: int = 120, keys: int | None = 
     from scipy.spatial.transform import Rotation, RotationSpline
 
     check_range("count", count, 1)
-    keys = max(count // FRAMES_PER_KEY, 2) if keys is None else keys
     viewmats, centres = camera_poses(cameras)
-    if len(cameras) > keys:
-        chosen = torch.linspace(0, len(cameras) - 1, keys, dtype=torch.float64).round().long()
-        viewmats, centres = viewmats[chosen], centres[chosen]
     turned = Rotation.from_matrix(viewmats[:, :3, :3].mT.numpy())
-    ways = (centres[1:] - centres[:-1]).norm(dim=1).numpy()
-    turns = (turned[:-1].inv() * turned[1:]).magnitude() if len(ways) else ways
-    # Equal poses in sequence become one key; otherwise the path would stop there.
-    spans = sum(x / x.mean() if x.sum() > 0.0 else 0.0 * x for x in (ways, turns)) if len(ways) else ways
-    distinct = np.concatenate([[True], spans > DEGENERATE])
-    if distinct.sum() < 2:
-        raise ValueError(f"cameras: expected at least two distinct ones, got {len(cameras)} that are the same")
-    times = np.concatenate([[0.0], spans.cumsum()])[distinct]
+    turns = (turned[:-1].inv() * turned[1:]).magnitude() if len(cameras) > 1 else np.zeros(0)
+    times, distinct = _times((centres[1:] - centres[:-1]).norm(dim=1).numpy(), turns)
     at = np.linspace(0.0, times[-1], count)
     positions = CubicSpline(times, centres.numpy()[distinct], bc_type="natural")(at)
     rotations = RotationSpline(times, turned[distinct])(at).inv().as_matrix()
     placed = zip(torch.from_numpy(rotations), torch.from_numpy(positions), strict=True)
     return [with_pose(cameras[0], rotation, position) for rotation, position in placed]
+
+
+def interpolate(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
+    """Return `count` cameras on a smooth path along the given ones, as someone walked who held the camera by hand.
+
+    Centres and viewing directions are means of those of neighbours in the list, under a Gaussian window of 2 cameras
+    (a tenth of the list if that is less). The path takes time in proportion to distance and turn. Its cameras are
+    upright as `up_direction`; all else is that of the first camera.
+
+    Raises:
+        ValueError: fewer than two distinct cameras, a path that looks straight up or down, or `count` < 1.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.ndimage import gaussian_filter1d
+
+    check_range("count", count, 1)
+    viewmats, centres = camera_poses(cameras)
+    up = up_direction(cameras)
+    poses = torch.cat([centres, viewmats[:, 2, :3]], dim=1).numpy()
+    smoothed = gaussian_filter1d(poses, min(WINDOW, len(cameras) / 10), axis=0, mode="nearest")
+    times, distinct = _times(*(np.linalg.norm(np.diff(x, axis=0), axis=1) for x in np.split(smoothed, 2, axis=1)))
+    at = np.linspace(0.0, times[-1], count)
+    path = torch.from_numpy(CubicSpline(times, smoothed[distinct], bc_type="natural")(at))
+    return [_looking(cameras[0], pose[:3], pose[:3] + pose[3:], up) for pose in path]
+
+
+def _times(ways: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times of the distinct poses among n, and which these are (n,), from the n - 1 distances and rotations."""
+    # Equal poses in sequence become one; otherwise the path would stop there.
+    spans = np.zeros(len(ways))
+    for lengths in (ways, turns):
+        spans += lengths / lengths.mean() if lengths.sum() > 0.0 else 0.0
+    distinct = np.concatenate([[True], spans > DEGENERATE])
+    if distinct.sum() < 2:
+        raise ValueError(f"cameras: expected at least two distinct ones, got {len(distinct)} that are the same")
+    return np.concatenate([[0.0], spans.cumsum()])[distinct], distinct
+
+
+def suited_path(cameras: Sequence[Camera]) -> str:
+    """Return "ellipse" for cameras that look at a common subject from all around it, otherwise "interpolate".
+
+    The focus must be in nine of ten images, and no angle about it of more than 120 degrees without a camera.
+    """
+    target, share = focus_ahead(cameras)
+    if share < COMMON:
+        return "interpolate"
+    viewmats, centres = camera_poses(cameras)
+    seen = torch.stack([each.K.detach().double().cpu() for each in cameras]) @ (
+        viewmats[:, :3, :3] @ target + viewmats[:, :3, 3]
+    ).unsqueeze(2)
+    places = seen[:, :2, 0] / seen[:, 2:, 0] / torch.tensor([[each.width, each.height] for each in cameras])
+    inside = ((seen[:, 2, 0] > 0.0) & ((places - 0.5).abs() < 0.5).all(dim=1)).double().mean()
+    level = torch.linalg.svd(up_direction(cameras)[None])[2][1:]
+    angles = torch.atan2(*((centres - target) @ level.T).unbind(1)).sort().values
+    gaps = torch.cat([angles, angles[:1] + 2.0 * math.pi]).diff()
+    return "ellipse" if inside >= COMMON and gaps.max() <= WIDEST_GAP else "interpolate"
 
 
 def between(cameras: Sequence[Camera], generator: torch.Generator) -> list[Camera]:

@@ -206,7 +206,7 @@ def _finite(value: Json) -> Json:
 class Render:
     """Render a run to RUN/renders: still views, a camera path, a video of the path, and buffers. Needs no photos.
 
-    Without options: the test views, and an ellipse of 120 frames. --path or --video renders the path, --set the still
+    Without options: the test views, and a path of 120 frames. --path or --video renders the path, --set the still
     views; combine them for both. docs/outputs.md describes paths and files.
     """
 
@@ -223,6 +223,9 @@ class Render:
         opened = open_model(self.run)
         model = opened.model.to(device)
         job = self.pictures.prepare(opened)
+        if self.pictures.path is None and job.path is not None:
+            surround = "surround" if job.path == "ellipse" else "do not surround"
+            console.print(f"--path {job.path}, as the cameras {surround} what they look at", soft_wrap=True)
         with display.counting(console, "rendering", len(job)) as done:
             job.render(model, done)
         console.print(f"{len(job)} pictures in {opened.folder / RENDERS_FOLDER}", soft_wrap=True)

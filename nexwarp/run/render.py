@@ -15,7 +15,7 @@ from tyro.conf import arg
 from nexwarp.cameras.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, WORLD
 from nexwarp.cameras.nerfstudio import load_camera_path
-from nexwarp.cameras.paths import PATHS
+from nexwarp.cameras.paths import PATHS, suited_path
 from nexwarp.cameras.ray_camera import MAX_SIDE, RayCamera
 from nexwarp.errors import RunError, SettingError
 from nexwarp.io.pictures import save_png, to_uint8
@@ -47,8 +47,9 @@ class PictureJob:
 class RenderOrder:
     """What `nexwarp render` shows, and how."""
 
-    path: Annotated[str | None, arg(metavar="PATH", help_behavior_hint="(default: ellipse)")] = None
-    """Camera path: ellipse, spiral, interpolate, or FILE.json, a nerfstudio camera path or a transforms.json."""
+    path: Annotated[str | None, arg(metavar="PATH", help_behavior_hint="(default: ellipse or interpolate)")] = None
+    """Camera path: ellipse, spiral, interpolate, or FILE.json, a nerfstudio camera path or a transforms.json. By
+    default an ellipse if the cameras surround what they look at, otherwise interpolate."""
     video: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
     """Also write the path as a video: .mp4, .mov, .mkv (H.264) or .webm (VP9). Needs the extra `video`."""
     frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 120, or that of FILE.json)")] = None
@@ -93,7 +94,7 @@ class RenderOrder:
                 "--frames: expected at least 1 for a path or a video, got 0",
             ),
             (
-                self.path_name is None and bool(self.frames),
+                not self.has_path and bool(self.frames),
                 "--frames: expected together with --path or --video, got --set alone",
             ),
             (self.fps is not None and self.video is None, "--fps: expected together with --video, got no --video"),
@@ -122,9 +123,9 @@ class RenderOrder:
                 raise SettingError(f"{option}: {str(error).removeprefix('fps: ')}") from None
 
     @property
-    def path_name(self) -> str | None:
-        """The path to render, if any: without any selection, show everything that the run can show."""
-        return self.path or (None if self.video is None and self.set is not None else "ellipse")
+    def has_path(self) -> bool:
+        """Whether there is a path to render: without any selection, show everything that the run can show."""
+        return self.path is not None or self.video is not None or self.set is None
 
     @property
     def views(self) -> str | None:
@@ -144,9 +145,10 @@ class RenderOrder:
             for group in SETS[self.views]
             for name, camera in cameras.get(group, {}).items()
         ]
-        fps = FPS
-        if self.path_name is not None and self.frames != 0:
-            folder, path, fps = self._path(self.path_name, opened, renders)
+        fps, name = FPS, None
+        if self.has_path and self.frames != 0:
+            name = self.path or suited_path(list(opened.path_cameras().get(TRAIN, {}).values()))
+            folder, path, fps = self._path(name, opened, renders)
             first = size(path[0])
             buffers = self.buffers and self.views is None
             for index, camera in enumerate(path):
@@ -155,7 +157,7 @@ class RenderOrder:
         if not pictures:
             file = opened.folder / CAMERAS_FILE
             raise RunError(f"{file}: expected {self.views} views to render, found none; see --path")
-        return RenderJob(pictures, self, fps if self.fps is None else self.fps)
+        return RenderJob(pictures, self, fps if self.fps is None else self.fps, name)
 
     def _path(self, name: str, opened: OpenedModel, renders: Path) -> tuple[Path, list[Camera], float]:
         """Return the folder of the frames, their cameras, and the frames per second."""
@@ -216,6 +218,7 @@ class RenderJob:
     pictures: list[PictureJob]
     order: RenderOrder
     fps: float = FPS
+    path: str | None = None  # name of the path, if any
 
     def __len__(self) -> int:
         return len(self.pictures)

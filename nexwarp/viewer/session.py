@@ -21,7 +21,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.cameras.paths import interpolate
+from nexwarp.cameras.paths import through
 from nexwarp.io.pictures import viridis
 from nexwarp.viewer.modes import BY_SLOT, MODES, RANGES, Picture, Settings
 from nexwarp.viewer.world import Viewpoint, camera_to_world, frustum_size, vertical_fov
@@ -120,7 +120,7 @@ class PathEditor:
 
     def path(self, fps: int) -> list[Camera]:
         """Return the path at some frames a second; ValueError without two different views."""
-        return interpolate(self.views, max(round(within(self.seconds.value, SECONDS) * fps), 2), len(self.views) or 2)
+        return through(self.views, max(round(within(self.seconds.value, SECONDS) * fps), 2))
 
     async def play(self) -> None:
         """Move along the path once; stop if that is in progress."""

@@ -10,7 +10,18 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nexwarp.cameras.camera import Camera, reduced, resized
-from nexwarp.cameras.paths import between, ellipse, focus, interpolate, look_at, spiral, up_direction
+from nexwarp.cameras.paths import (
+    between,
+    camera_poses,
+    ellipse,
+    focus,
+    interpolate,
+    look_at,
+    spiral,
+    suited_path,
+    through,
+    up_direction,
+)
 from tests.tolerances import assert_close
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -151,7 +162,9 @@ def test_spiral_looks_at_the_focus_or_along_the_mean_direction() -> None:
             assert_close(each.viewmat[2, :3], forward / forward.norm(), kind="value", name="forward")
 
 
-PATHS = pytest.mark.parametrize(("make", "cameras_of"), [(ellipse, ring), (spiral, row), (interpolate, row)])
+PATHS = pytest.mark.parametrize(
+    ("make", "cameras_of"), [(ellipse, ring), (spiral, row), (interpolate, row), (through, row)]
+)
 
 
 @PATHS
@@ -176,33 +189,64 @@ def test_paths_take_the_rest_from_the_first_camera(make, cameras_of, device: tor
 # Interpolation
 
 
-def test_interpolation_passes_through_every_key_in_turn() -> None:
+def test_a_path_through_cameras_passes_every_one_in_turn() -> None:
     cameras = ring(6)
-    path = interpolate(cameras, 2001)
+    path = through(cameras, 2001)
     errors = [(torch.stack([each.viewmat for each in path]) - c.viewmat).abs().amax((1, 2)) for c in cameras]
     assert all(error.min() < 2e-2 for error in errors)
     order = [error.argmin().item() for error in errors]
     assert order == sorted(order) and order[0] == 0 and order[-1] == 2000
     assert errors[0][0] < 1e-9 and errors[-1][-1] < 1e-9
+    assert len(through(cameras, 1)) == 1
 
 
-def test_interpolation_thins_many_cameras() -> None:
-    cameras = ring(50)
-    path = interpolate(cameras, 39)
-    expected = interpolate([cameras[0], cameras[24], cameras[49]], 39)
-    for mine, theirs in zip(path, expected, strict=True):
-        assert mine.viewmat.equal(theirs.viewmat)
-    assert len(interpolate(cameras, 1)) == 1
-
-
-def test_interpolation_is_smooth() -> None:
+@pytest.mark.parametrize("make", [through, interpolate])
+def test_interpolation_is_smooth(make: Callable[..., list[Camera]]) -> None:
     """Neither the way nor the direction jumps from one frame to the next, at the keys included."""
-    path = torch.stack([each.viewmat for each in interpolate(ring(8), 2000)])
+    path = torch.stack([each.viewmat for each in make(ring(8), 2000)])
     first = path.diff(dim=0).flatten(1).norm(dim=1)
     second = path.diff(n=2, dim=0).flatten(1).norm(dim=1)
     assert first.max() < 8 * first.mean() and second.max() < 0.05 * first.mean()
     rotations = path[:, :3, :3]
     assert (rotations @ rotations.mT - torch.eye(3)).abs().max() < 1e-12
+
+
+def walk(count: int = 60, arc: float = 2 * math.pi) -> list[Camera]:
+    """Cameras held by hand on the way along an arc about the origin: they sway, roll and look about it."""
+    cameras = []
+    for angle in torch.linspace(0.0, arc, count, dtype=torch.float64):
+        place = torch.stack([3.0 * angle.cos(), 3.0 * angle.sin(), angle.new_tensor(1.0)])
+        sway, aim, roll = 0.1 * torch.randn(3, 3, dtype=torch.float64)
+        cameras.append(camera(place + sway, 2 * aim, UP + roll))
+    return cameras
+
+
+def test_a_walk_by_hand_becomes_a_steady_path() -> None:
+    from scipy.spatial import ConvexHull
+
+    cameras = walk()
+    path = interpolate(cameras, 60)
+    up, (viewmats, places), given = up_direction(cameras), camera_poses(path), positions(cameras)
+    assert up @ UP > math.cos(math.radians(3.0))
+    assert (viewmats[:, 0, :3] @ up).abs().max() < 1e-12 and (viewmats[:, 1, :3] @ up).max() < 0.0, "no roll"
+    hull = torch.from_numpy(ConvexHull(given).equations)
+    assert (places @ hull[:, :3].T + hull[:, 3]).max() < 0.01, "within the hull of the cameras"
+    unsteady, steady = (x.diff(n=2, dim=0).norm(dim=1).mean() for x in (given, places))
+    assert steady < 0.2 * unsteady
+    aims, own = (m[:, 2, :3].diff(n=2, dim=0).norm(dim=1).mean() for m in (viewmats, camera_poses(cameras)[0]))
+    assert aims < 0.2 * own
+    assert (places[:, :2].norm(dim=1) > 2.7).all(), "as far away as the photos were"
+    seen = viewmats[:, :3, 3] @ INTRINSICS.T  # the origin, which the cameras look at
+    x, y = (seen[:, :2] / seen[:, 2:]).unbind(1)
+    assert (seen[:, 2] > 0).all() and ((x - 33).abs() < 12).all() and ((y - 20).abs() < 12).all()
+
+
+def test_an_ellipse_suits_cameras_around_a_subject_that_they_look_at() -> None:
+    assert suited_path(walk()) == suited_path(ring(count=60)) == "ellipse"
+    outwards = [camera(place, 2 * place) for place in positions(walk())]
+    aside = [camera(place, place + torch.linalg.cross(place, UP)) for place in positions(walk())]
+    for others in (walk(arc=math.pi), row(), outwards, aside, [ONE], []):
+        assert suited_path(others) == "interpolate"
 
 
 ONE = camera(torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
@@ -213,12 +257,19 @@ PARALLEL = "cameras: expected two or more with axes that are not parallel"
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [
-        *((make, [[]], "cameras: expected at least one, got none") for make in (ellipse, spiral, interpolate)),
-        *((make, [[ONE, ASIDE], 0], "count: expected at least 1, got 0") for make in (ellipse, spiral, interpolate)),
+        *((make, [[]], "cameras: expected at least one, got none") for make in (ellipse, spiral, interpolate, through)),
+        *(
+            (make, [[ONE, ASIDE], 0], "count: expected at least 1, got 0")
+            for make in (ellipse, spiral, interpolate, through)
+        ),
         *((ellipse, [each], PARALLEL) for each in ([ONE], [ONE, ONE])),
         (ellipse, [[ONE, ASIDE]], "cameras: expected at least two distinct centres"),
         *((spiral, [each], "cameras: expected at least two distinct centres") for each in ([ONE], 3 * [ONE])),
-        *((interpolate, [each], "cameras: expected at least two distinct ones, got") for each in ([ONE], 3 * [ONE])),
+        *(
+            (make, [each], f"cameras: expected at least two distinct ones, got {len(each)}")
+            for make in (interpolate, through)
+            for each in ([ONE], 3 * [ONE])
+        ),
         (spiral, [[ONE, camera(torch.ones(3), torch.zeros(3)), ASIDE]], r"that face one way, .* an ellipse suits"),
         (look_at, [UP, 3 * UP, UP], "up: expected a direction across the line"),
     ],

@@ -25,7 +25,7 @@ from nexwarp.model.model_file import save_model
 from nexwarp.model.options import RenderOptions
 from nexwarp.run.folder import RunRecord, create_run
 from nexwarp.train.recipe import Config
-from tests.cameras.test_paths import ring
+from tests.cameras.test_paths import ring, row
 from tests.data.inputs import room
 from tests.scenes import make_surfels, make_texture, random_scene
 
@@ -120,6 +120,18 @@ def test_paths_are_those_of_the_runs_cameras(run: Path) -> None:
     assert not (run / "renders" / "test").exists()
 
 
+def test_the_path_suits_the_capture_and_is_told(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    around = {str(i): each.to(torch.float32) for i, each in enumerate(ring(24))}
+    ahead = {str(i): each.to(torch.float32) for i, each in enumerate(row())}
+    for name, views, words in (("ellipse", around, "surround"), ("interpolate", ahead, "do not surround")):
+        save_cameras(run / "cameras.json", {"train": views, "test": {}})
+        assert command("render", run, "--frames", "2") == 0
+        assert f"--path {name}, as the cameras {words} what they look at\n" in capsys.readouterr().out
+        assert files(run / "renders" / name) == {"0000.png", "0001.png"}
+    assert command("render", run, "--frames", "2", "--path", "ellipse") == 0
+    assert "as the cameras" not in capsys.readouterr().out
+
+
 def test_a_shorter_path_leaves_no_frames_of_a_longer_one(run: Path) -> None:
     for count in (3, 2):
         assert command("render", run, "--path", "ellipse", "--frames", count) == 0
@@ -154,13 +166,13 @@ def test_video(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert command("render", run, "--video", video, "--frames", "6", "--fps", "12", "--scale", "2") == 0
     assert f"0.50 s of video in {video}" in capsys.readouterr().out
     assert [f.name for f in video.parent.iterdir()] == ["out.mp4"]
-    assert files(run / "renders") == {f"ellipse/{i:04d}.png" for i in range(6)}
+    assert files(run / "renders") == {f"interpolate/{i:04d}.png" for i in range(6)}
     with av.open(str(video)) as container:
         (stream,) = container.streams.video
         decoded = [torch.from_numpy(f.to_ndarray(format="rgb24")) for f in container.decode(stream)]
         assert len(decoded) == 6 and stream.average_rate == 12
     for i, mine in enumerate(decoded):
-        frame = picture(run / "renders" / "ellipse" / f"{i:04d}.png")
+        frame = picture(run / "renders" / "interpolate" / f"{i:04d}.png")
         assert mine.shape == frame.shape == (96, 128, 3)
         # Of noise, 4:2:0 keeps the brightness alone.
         error = (mine.float() - frame.float()) @ torch.tensor([0.2126, 0.7152, 0.0722])
@@ -182,7 +194,7 @@ def test_buffers_of_views_or_else_of_frames(run: Path) -> None:
     shutil.rmtree(run / "renders")
     assert command("render", run, "--frames", "1", "--buffers") == 0
     exr = {name for name in files(run / "renders") if name.endswith(".exr")}
-    assert exr == {"test/a.exr", "test/sub/f.exr"} and (run / "renders" / "ellipse" / "0000.png").is_file()
+    assert exr == {"test/a.exr", "test/sub/f.exr"} and (run / "renders" / "interpolate" / "0000.png").is_file()
 
 
 # Exports
@@ -322,8 +334,9 @@ def test_cameras_that_no_path_suits(refuses: Callable[..., None], run: Path) -> 
     around = {str(i): each.to(torch.float32) for i, each in enumerate(ring(24, height=0.6))}
     save_cameras(run / "cameras.json", {"train": around, "test": {}})
     refuses(["render", "--path", "spiral"], "--path spiral: cameras: expected cameras that face one way")
-    save_cameras(run / "cameras.json", {"train": {"0": around["0"]}, "test": {"1": around["1"]}})
-    refuses(["render"], "--path ellipse: cameras: expected two or more", "--frames 0 renders the still views alone")
+    alone = "expected at least two distinct ones"
+    save_cameras(run / "cameras.json", {"train": {"0": around["0"]}, "test": {"1": around["0"]}})
+    refuses(["render"], f"--path interpolate: cameras: {alone}", "--frames 0 renders the still views alone")
 
 
 def test_bad_exports(refuses: Callable[..., None], run: Path, tmp_path: Path) -> None:
