@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -66,7 +67,9 @@ class Process:
     def __call__(self, console: Console) -> None:
         """Make the scene."""
         self.make(console)
-        console.print(f"next: nexwarp train {self.scene}", soft_wrap=True, markup=False, highlight=False)
+        console.print(
+            f"next: nexwarp train {shlex.quote(str(self.scene))}", soft_wrap=True, markup=False, highlight=False
+        )
 
     def make(self, console: Console) -> None:
         """Make the scene, and print the report."""

@@ -21,7 +21,7 @@ from rich.table import Table
 
 from nexwarp.io.files import printable
 from nexwarp.run.log import peak_memory
-from nexwarp.train.report import StepReport
+from nexwarp.train.report import StepReport, TimeLeft
 
 REFRESH_SECONDS = 0.5
 LOG_LINES = 20
@@ -51,21 +51,22 @@ def plain_warnings(console: Console) -> Iterator[None]:
 
 @contextmanager
 def training(
-    console: Console, total: int, done: int, device: torch.device, name: str
+    console: Console, total: int, done: int, device: torch.device, name: str, left: TimeLeft
 ) -> Iterator[Callable[[StepReport], None]]:
-    """Show iteration, it/s, time left, loss, training PSNR, surfels and memory of `total` iterations.
+    """Show iteration, it/s, loss, training PSNR, surfels and memory of `total` iterations, and the whole run's time.
 
     `done` of them were done before. Yield a function to call after each step: its numbers are fetched from the device
     only when they are shown.
     """
     start = shown = time.perf_counter()
     text = TextColumn("{task.fields[text]}")
-    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), text, TimeElapsedColumn(), TimeRemainingColumn())
+    columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), text, TimeElapsedColumn())
+    noted = done
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task(name, total=total, completed=done, text="")
 
         def show(step: StepReport) -> None:
-            nonlocal shown
+            nonlocal shown, noted
             now = time.perf_counter()
             if console.is_terminal:
                 due = now - shown >= REFRESH_SECONDS
@@ -78,9 +79,10 @@ def training(
             text = f"{rate:.1f} it/s  loss {step.loss():.4f}  train {step.psnr():.2f} dB  {step.surfels:,} surfels"
             if (used := peak_memory(device)) is not None:
                 text += f"  {used / 2**30:.1f} GiB{' GPU' if device.type == 'cuda' else ''}"
-            progress.update(task, completed=step.iteration, text=text)
+            left.spend(step.iteration - noted)
+            noted = step.iteration
+            progress.update(task, completed=step.iteration, text=f"{text}  {left}")
             if not console.is_terminal:
-                left = f"{(total - step.iteration) / max(rate, 1e-9):.0f} s left"
                 console.print(f"iteration {step.iteration:,}/{total:,}  {text}  {left}", soft_wrap=True)
 
         yield show
@@ -109,7 +111,7 @@ def loading(console: Console) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextmanager
-def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
+def stages(console: Console, left: TimeLeft | None = None) -> Iterator[Callable[[str, int, int], None]]:
     """Show a bar, or a line in a log file, for each stage; yield a function of its name, items done and total."""
     tasks: dict[str, TaskID] = {}
     with _bars(console, TimeElapsedColumn()) as progress:
@@ -119,7 +121,8 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
                 tasks[stage] = progress.add_task(stage, total=total)
                 if not console.is_terminal:
                     console.print(f"{stage}: {total:,}", soft_wrap=True)
-            progress.update(tasks[stage], completed=done)
+            note = "" if left is None else f"  {left}"
+            progress.update(tasks[stage], completed=done, description=f"{stage}{note}")
 
         yield observe
 

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -39,14 +39,15 @@ from nexwarp.run.folder import (
 from nexwarp.run.log import TrainingLog
 from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
-from nexwarp.train.report import StepReport
-from nexwarp.train.stages import Stage, StageStore
+from nexwarp.train.report import StepReport, TimeLeft
+from nexwarp.train.stages import RENDERED, Stage, StageStore, divide
 from nexwarp.train.trainer import Trainer
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
 
 CHECKPOINTS_A_RUN = 10
+JUDGED = 1e-6  # seconds a pixel that metrics and pictures of a test view take beside its rendering, on two cores
 
 
 @dataclass
@@ -66,6 +67,7 @@ class Session(StageStore):
     every: int | None = None  # iterations between checkpoints; None saves ten a stage
     viewer: "Viewer | None" = None
     seconds: float = 0.0  # that complete teachers took
+    left: TimeLeft = field(default_factory=TimeLeft)  # of all stages and the evaluation
     begun: bool = False
 
     def complete(self, stage: Stage) -> Model | None:
@@ -95,6 +97,12 @@ class Session(StageStore):
             self.console.print(f"resumed at iteration {trainer.iteration:,}")
         elif self.resume and not self.begun:
             self.console.print(f"{folder}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
+        if not self.begun:
+            photos, tests = len(trainer.scene.train), trainer.scene.test
+            coming = [s for s in divide(self.record.config, self.record.own) if s.before >= stage.before]
+            pixels = sum(view.camera.width * view.camera.height for view in tests)
+            work = sum(s.work(photos) for s in coming) + RENDERED * len(tests)
+            self.left = TimeLeft(work - trainer.iteration, JUDGED * pixels)
         self.begun = True
 
     def train(self, stage: Stage, trainer: Trainer) -> None:
@@ -107,7 +115,7 @@ class Session(StageStore):
             create_run(folder, RunRecord(self.record.source, stage.config, self.ranks.device.type))
         total = stage.config.iterations
         every = self.every or max(total // CHECKPOINTS_A_RUN, 1)
-        bar = display.training(self.console, total, trainer.iteration, trainer.device, stage.name)
+        bar = display.training(self.console, total, trainer.iteration, trainer.device, stage.name, self.left)
         log = TrainingLog(folder, trainer, tensorboard=self.tensorboard and not stage.teacher)
         with ExitStack() as stack:
             if self.ranks.first:
@@ -193,7 +201,12 @@ class Session(StageStore):
     def _write(self, stage: Stage, trainer: Trainer) -> Model:
         """Finish and write the model of a stage, its cameras and figures; a student's have the time of its teachers."""
         folder = self._folder(stage)
-        with display.stages(self.console) as observe:
+        with display.stages(self.console, self.left) as show:
+
+            def observe(name: str, done: int, total: int) -> None:
+                self.left.spend(RENDERED)
+                show(name, done, total)
+
             finished = trainer.finish(observe)
         file = save_model(folder, finished)
         model = shared_model(file, self.ranks)

@@ -1,6 +1,7 @@
 """`nexwarp train`."""
 
 import dataclasses
+import shlex
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -158,6 +159,10 @@ class Train:
                 session.viewer = viewer
                 runner.train()
                 model = runner.finish()
+                quoted = shlex.quote(str(run))
+                show = f"nexwarp view {quoted} (in the browser)"
+                share = f"nexwarp export {quoted} --format web (a page to share)"
+                console.print(f"next: {show}, {share}", soft_wrap=True, markup=False, highlight=False)
                 claim.close()  # while the viewer shows the result, other commands may write to the run
                 ranks.close()
                 if viewer is not None:
@@ -322,10 +327,10 @@ def _naming(flag: str) -> Iterator[None]:
 def _load_scene(record: RunRecord, ranks: Ranks, console: Console) -> Scene:
     """Load the scene, and say what it holds."""
     count = f", {ranks.size} ranks" if ranks.size > 1 else ""
-    console.print(f"{record.source.name} on {device_name(ranks.device)}{count}, preset {record.config.preset}")
     with display.loading(console) as progress:
         scene = record.source.load(progress)
     size = scene.train[0].camera
+    console.print(f"{record.source.name} on {device_name(ranks.device)}{count}, preset {record.config.preset}")
     console.print(
         f"{len(scene.train)} training and {len(scene.test)} test views of {size.width}x{size.height}, "
         f"{len(scene.points):,} points"

@@ -22,8 +22,8 @@ from nexwarp.train import trainer as trainer_module
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import TextureConfig
-from nexwarp.train.report import StepReport
-from nexwarp.train.stages import OwnTeachers, StageRunner, divide, plan_teachers
+from nexwarp.train.report import StepReport, TimeLeft
+from nexwarp.train.stages import RENDERED, OwnTeachers, StageRunner, divide, plan_teachers
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -381,3 +381,33 @@ def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
     create_run(run, record)
     runner.train()
     assert steps == [*range(1, 21)] and drawn == [1, 2, 3, 4, 1, 2, 3, 4, *range(1, 13)]
+
+
+def test_the_time_left_is_that_of_all_stages(tiny_scene: Scene, tmp_path: Path) -> None:
+    """Before the first step, all steps and renderings are left; before the evaluation, only those that it renders."""
+    run, photos, tests = tmp_path / "run", len(tiny_scene.train), len(tiny_scene.test)
+    record = RunRecord(SceneSource(str(tiny_scene.path)), CONFIG, own=OwnTeachers(2, 4, 240))
+    session = Session(run, record, Console(quiet=True), Ranks.alone(CPU))
+    runner = StageRunner(tiny_scene, CONFIG, CPU, session, own=record.own)
+    passes = (CONFIG.smooth_sh > 0) + CONFIG.footprints
+    assert session.left.work == CONFIG.iterations + RENDERED * (3 * passes * photos + tests)
+    create_run(run, record)
+    runner.train()
+    runner.finish()
+    assert session.left.work == pytest.approx(RENDERED * tests)
+
+
+def test_the_time_left_follows_the_recent_speed() -> None:
+    now = 0.0
+    left = TimeLeft(1000.0, 7.0, clock=lambda: now)
+    for _ in range(100):
+        now += 2.0
+        left.spend(1.0)
+    assert left.seconds() == pytest.approx(900 * 2 + 7) and str(left) == "30 min left in all"
+    for _ in range(300):
+        now += 0.5
+        left.spend(1.0)
+    assert left.seconds() == pytest.approx(600 * 0.5 + 7, rel=0.05)
+    left.spend(600.0)
+    assert str(left) == "7 s left in all"
+    assert str(TimeLeft(0.0, 3 * 3600 + 300)) == "3 h 5 min left in all"
