@@ -27,7 +27,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.run import warmup
 from nexwarp.run.evaluate import check_metrics, evaluate
-from nexwarp.run.export import ExportOrder, export_run
+from nexwarp.run.export import RENDERED, ExportOrder, export_run
 from nexwarp.run.fit_poses import fit_poses
 from nexwarp.run.folder import (
     METRICS_FILE,
@@ -257,7 +257,7 @@ class Export:
         self.files.check()
         opened = open_model(self.run)
         device = pick_device(self.device)
-        if self.files.format == "mesh":
+        if self.files.format in RENDERED:
             with display.stages(console) as observe:
                 files = export_run(opened, self.files, device, observe)
         else:

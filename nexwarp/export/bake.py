@@ -4,7 +4,7 @@ The texture is evaluated at the texels, then texels and SH are fitted to the mod
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -38,6 +38,8 @@ PASSES = 2.0  # over the views' pixels
 FEWEST_STEPS, MOST_STEPS = 70, 800
 RATES = {"atlas": 0.02, "sh0": 5e-3, "shN": 2e-3}
 LAST_RATE = 0.1  # relative to the first
+
+Progress = Callable[[str, int, int], object]
 
 
 @dataclass(frozen=True)
@@ -131,16 +133,20 @@ class Baked:
         return ops.plain_colors((surfels.sh0, surfels.shN), self.seen.directions, surfels.means.new_zeros(3), degree)
 
 
-def bake(model: Model, cameras: Sequence[Camera], *, steps: int | None = None) -> Baked:
+def bake(
+    model: Model, cameras: Sequence[Camera], *, steps: int | None = None, progress: Progress = lambda *_: None
+) -> Baked:
     """Bake a model's texture into an atlas whose texels are about a pixel of the closest of the given views.
 
-    The number of steps of the fit follows from that of the views' pixels unless it is given.
+    The number of steps of the fit follows from that of the views' pixels unless it is given. `progress` is called with
+    each stage's name, how many views or steps of it are done, and of how many.
     """
     if steps is None:
         windows = sum(camera.width * camera.height for camera in cameras) / WINDOW**2
         steps = min(max(round(PASSES * windows), FEWEST_STEPS), MOST_STEPS)
-    seen = observe(model, cameras)
-    return fit(evaluate(model, seen, lay_out(seen.boxes, seen.pixels)), cameras, steps)
+    seen = observe(model, cameras, partial(progress, "measuring surfels"))
+    baked = evaluate(model, seen, lay_out(seen.boxes, seen.pixels))
+    return fit(baked, cameras, steps, partial(progress, "baking the texture"))
 
 
 def axes(surfels: Surfels) -> tuple[torch.Tensor, torch.Tensor]:
@@ -183,14 +189,16 @@ def hits_of(bare: Model, camera: Camera) -> ViewHits:
 
 
 @torch.no_grad()
-def observe(model: Model, cameras: Sequence[Camera]) -> Observations:
+def observe(
+    model: Model, cameras: Sequence[Camera], progress: Callable[[int, int], object] = lambda *_: None
+) -> Observations:
     """Render all views without texture and gather what they see of each surfel; K decides which hits are textured."""
     bare, kept = untextured(model), model.options.max_hits
     count, means = len(model.surfels), model.surfels.means.detach()
     boxes = means.new_tensor([NOWHERE, NOWHERE, -NOWHERE, -NOWHERE]).repeat(count, 1)
     pixels, total, textured = means.new_zeros(count, 2), means.new_zeros(count), means.new_zeros(count)
     directions, scales, sides = means.new_zeros(count, 3), model.surfels.scales.detach(), axes(model.surfels)
-    for camera in cameras:
+    for done, camera in enumerate(cameras, 1):
         hits = hits_of(bare, camera)
         total.index_add_(0, hits.ids, hits.weights)
         directions.index_add_(0, hits.ids, hits.weights[:, None] * hits.directions)
@@ -206,6 +214,7 @@ def observe(model: Model, cameras: Sequence[Camera]) -> Observations:
         sizes = hits.depths[heavy] / camera.focal
         covered = scales[ids] * (1 - cosines.square()).clamp_min(0).sqrt() / sizes[:, None]
         pixels.scatter_reduce_(0, pairs, covered, "amax")
+        progress(done, len(cameras))
     return Observations(boxes, pixels, textured / total.clamp_min(1e-12), normalize(directions, dim=-1))
 
 
@@ -292,7 +301,9 @@ def evaluate(model: Model, seen: Observations, layout: Layout) -> Baked:
     return baked
 
 
-def fit(baked: Baked, cameras: Sequence[Camera], steps: int) -> Baked:
+def fit(
+    baked: Baked, cameras: Sequence[Camera], steps: int, progress: Callable[[int, int], object] = lambda *_: None
+) -> Baked:
     """Fit atlas and SH to the model's renderings by least squares: Adam, a window of one view a step."""
     model, degree = baked.model, baked.model.options.sh_degree
     state = {name: x.detach().clone() for name, x in baked.surfels.state_dict().items()}
@@ -303,7 +314,7 @@ def fit(baked: Baked, cameras: Sequence[Camera], steps: int) -> Baked:
     bare = untextured(model)
     order = torch.Generator().manual_seed(0)
     views: list[int] = []
-    for _ in range(steps):
+    for done in range(1, steps + 1):
         views = views or torch.randperm(len(cameras), generator=order).tolist()
         camera = _window(cameras[views.pop()].to(model.device), order)
         target = model.render_image(camera, exposure="mean")
@@ -318,6 +329,7 @@ def fit(baked: Baked, cameras: Sequence[Camera], steps: int) -> Baked:
         loss.backward()
         optimizer.step()
         schedule.step()
+        progress(done, steps)
     state |= {name: trained[name].detach() for name in ("sh0", "shN")}
     return replace(baked, surfels=Surfels(state), atlas=trained["atlas"].detach())
 

@@ -64,8 +64,12 @@ def extract_mesh(
     if far is None:
         far = FAR * float(scale) if isinstance(scale, (int, float)) else math.inf
     if voxel is None:
-        views = ((_depths(model, camera, far)[0], camera.focal) for camera in cameras)
-        sizes = [seen.median().item() / focal for depths, focal in views if len(seen := depths[depths > 0])]
+        sizes = []
+        for done, camera in enumerate(cameras, 1):
+            depths = _depths(model, camera, far)[0]
+            if len(seen := depths[depths > 0]):
+                sizes.append(seen.median().item() / camera.focal)
+            observe("choosing the voxel", done, len(cameras))
         voxel = median(sizes or [1.0]) * PIXELS_A_VOXEL
     field = DistanceField(voxel, TRUNCATION * voxel, model.device)
     try:

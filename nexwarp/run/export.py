@@ -28,6 +28,7 @@ from nexwarp.model.model_file import save_model
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
 
 PACKAGES = {"glb": ("trimesh", "glb"), "spz": ("gaussforge", "splats")}  # that formats need, and their extras
+RENDERED = ("mesh", "web", "glb")  # formats that are made of renderings, stage by stage
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows
 
 
@@ -75,8 +76,8 @@ def export_run(
 ) -> Sequence[Path]:
     """Export a run or a model, and return the files that were written; docs/outputs.md describes them.
 
-    `device` renders what a mesh or a baked texture is made of; `observe` is the progress of
-    `nexwarp.export.mesh.extract_mesh`.
+    `device` renders what a mesh or a baked texture is made of; `observe` is called with the name of each of their
+    stages, how many views, blocks or steps of it are done, and of how many.
     """
     order.check()
     folder = order.out or opened.folder / EXPORT_FOLDER
@@ -102,7 +103,7 @@ def _export(
         from nexwarp.export.web.export import export_web
 
         model, page = opened.model.to(device), order.out or files[0]
-        return export_web(model, views, page, quality=order.quality, title=opened.title or "nexwarp")
+        return export_web(model, views, page, quality=order.quality, title=opened.title or "nexwarp", progress=observe)
     if order.format == "cameras":
         _export_cameras(opened, *files)
     elif order.format == "mesh":
@@ -117,7 +118,7 @@ def _export(
         if not views:
             raise RunError(f"{opened.path}: --format glb: expected the run's {CAMERAS_FILE}, found none")
         cameras = list(views.values())
-        save_glb(files[0], bake(opened.model.to(device), cameras), cameras)
+        save_glb(files[0], bake(opened.model.to(device), cameras, progress=observe), cameras)
     else:
         surfels, degree = opened.model.surfels, min(opened.model.options.sh_degree, SPLAT_DEGREE)
         if order.format == "ply":

@@ -4,6 +4,8 @@ import pytest
 
 from nexwarp.cli import main as cli
 from nexwarp.export.web import baked
+from nexwarp.run.export import ExportOrder, export_run
+from nexwarp.run.folder import open_model
 from tests.cli.support import refused
 
 
@@ -38,6 +40,29 @@ def test_a_finished_run_becomes_gltf_and_spz(finished, monkeypatch, capsys):
             patch.setattr("importlib.util.find_spec", lambda name: None)
             refused(capsys, ["export", str(finished), "--format", kind, "--device", "cpu"], package, "pip install")
         assert not (finished / "export" / name).exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "stages"),
+    [
+        ("web", {"measuring surfels": 10, "baking the texture": 2}),
+        ("mesh", {"choosing the voxel": 8, "finding surfaces": 8, "fusing depths": 8}),
+    ],
+)
+def test_exports_tell_their_stages(kind, stages, finished, capsys):
+    """Each counts to its end; where no terminal shows a bar, it is a line."""
+    counts: dict[str, list[tuple[int, int]]] = {}
+
+    def observe(stage, done, total):
+        counts.setdefault(stage, []).append((done, total))
+
+    export_run(open_model(finished), ExportOrder(kind), observe=observe)
+    assert cli.main(["export", str(finished), "--format", kind, "--device", "cpu"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[: len(stages)] == [f"{stage}: {total}" for stage, total in stages.items()]
+    assert all(line.isprintable() for line in lines)
+    for stage, total in stages.items():
+        assert counts[stage] == [(done, total) for done in range(1, total + 1)]
 
 
 def test_a_run_without_cameras_has_no_gltf(finished, capsys):

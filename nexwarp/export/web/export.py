@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from nexwarp.cameras.camera import Camera, resized
-from nexwarp.export.bake import bake
+from nexwarp.export.bake import Progress, bake
 from nexwarp.export.web.baked import encode_baked
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
 from nexwarp.io.files import write_together
@@ -27,13 +27,20 @@ POSTER_QUALITY = 75
 
 
 def export_web(
-    model: Model, cameras: Mapping[str, Camera], out: Path, *, quality: str = "quantised", title: str = "nexwarp"
+    model: Model,
+    cameras: Mapping[str, Camera],
+    out: Path,
+    *,
+    quality: str = "quantised",
+    title: str = "nexwarp",
+    progress: Progress = lambda *_: None,
 ) -> list[Path]:
     """Write the page of a scene, and return its files; it starts at the first of the cameras by name.
 
-    `out` is a file name that ends in .html, or a folder; `quality` of the scene file is "quantised" or "full".
+    `out` is a file name that ends in .html, or a folder; `quality` of the scene file is "quantised" or "full";
+    `progress` is that of `nexwarp.export.bake.bake`.
     """
-    content = page_files(model, cameras, quality=quality, title=title)
+    content = page_files(model, cameras, quality=quality, title=title, progress=progress)
     if out.suffix == ".html":
         content = {out.name: one_file(content)}
         out = out.parent
@@ -43,7 +50,12 @@ def export_web(
 
 
 def page_files(
-    model: Model, cameras: Mapping[str, Camera], *, quality: str = "quantised", title: str = "nexwarp"
+    model: Model,
+    cameras: Mapping[str, Camera],
+    *,
+    quality: str = "quantised",
+    title: str = "nexwarp",
+    progress: Progress = lambda *_: None,
 ) -> dict[str, bytes]:
     """Return the content of the page's files by name."""
     content = dict(static_files())
@@ -51,7 +63,7 @@ def page_files(
     poster = _poster(model, next(iter(cameras.values()))) if cameras else None
     content[SCENE_FILE] = encode_scene(model, cameras, quality=quality, title=title, poster=poster)
     if cameras and len(model.surfels):
-        content |= encode_baked(bake(model, list(cameras.values())), cameras)
+        content |= encode_baked(bake(model, list(cameras.values()), progress=progress), cameras)
     return content
 
 

@@ -200,7 +200,7 @@ def test_the_page_names_no_other_server():
 
 
 def test_titles_are_text(tmp_path, monkeypatch):
-    monkeypatch.setattr("nexwarp.export.web.export.bake", lambda *_: None)
+    monkeypatch.setattr("nexwarp.export.web.export.bake", lambda *_, **__: None)
     monkeypatch.setattr("nexwarp.export.web.export.encode_baked", lambda *_: {})
     model, camera = web_model(5)
     files = export_web(model, named_cameras(camera), tmp_path / "page", title="<b>R&D</b>")
