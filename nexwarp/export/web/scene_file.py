@@ -147,7 +147,9 @@ def scene_header(
     kept = list(cameras.items())[:: -(-len(cameras) // MOST_CAMERAS) or 1]
     views = [camera for _, camera in kept]
     low, high = (np.percentile(means, q, axis=0) if len(means) else np.zeros(3) for q in (2, 98))
-    center, share = focus_ahead(views)
+    focus, share = focus_ahead(views)
+    center = focus.numpy() if share > 0.5 else (low + high) / 2
+    radius = float(np.median(np.linalg.norm(means - center, axis=1))) if len(means) else 0.0
     header: dict[str, object] = {
         "format_version": FORMAT_VERSION,
         "generator": "nexwarp",
@@ -171,7 +173,8 @@ def scene_header(
             for name, camera in kept
         ],
         "start": 0,
-        "center": _floats(center.numpy() if share > 0.5 else (low + high) / 2),
+        "center": _floats(center),
+        "radius": radius or None,
         "up": _floats(up_direction(views).numpy()),
         "bounds": [_floats(low), _floats(high)],
         "poster": None,

@@ -244,6 +244,47 @@ def test_touch_on_a_phone(open_tab):
     assert not tab.errors
 
 
+@pytest.mark.parametrize("size", [(390, 844), (1280, 800)])
+def test_the_subject_fits_from_side_to_side(open_tab, site, size):
+    """A narrow window shows the subject, or the photo if that is narrower, unless that takes more than 1 / 0.4 of its
+    height; no window shows less than the photo's height."""
+    tab = open_tab(*size)
+    good = site[BAKED_FILE]
+    header = header_of(good)
+    wide = [{**camera, "width": 2 * camera["width"]} for camera in header["cameras"]]
+    for camera in wide:
+        camera["K"] = [*camera["K"][:2], 2 * camera["K"][2], camera["K"][3]]
+    photo = wide[header["start"]]
+    across, along = photo["width"] / 2 / photo["K"][0], photo["height"] / 2 / photo["K"][1]
+    depth = np.array(photo["viewmat"]).reshape(4, 4)[2] @ [*header["center"], 1.0]
+    for subject in (along / 2, along * 1.1, across * 2):
+        tab.files = {**site, BAKED_FILE: rebuilt(good, cameras=wide, radius=depth * subject)}
+        tab.open("?renderer=baked")
+        pose = "nexwarp.pose.camera(nexwarp.canvas.width, nexwarp.canvas.height, 1)"
+        width, height, fx, fy = tab.value(f"(c => [c.width, c.height, c.K[0], c.K[1]])({pose})")
+        assert (width, height) == size
+        half = min(max(subject, along), across)  # width to show, in tangents
+        expected = max(along, min(half * height / width, along / 0.4))
+        assert height / 2 / fy == pytest.approx(expected, rel=1e-5) and fx == pytest.approx(fy, rel=1e-5)
+    assert not tab.errors
+
+
+def test_the_status_is_in_the_settings_and_notes_pass(open_tab):
+    tab = open_tab(390, 844)
+    tab.open("?renderer=baked")
+    status, note = tab.page.locator("#status"), tab.page.locator("#announce")
+    assert not status.is_visible()
+    tab.page.click("#more")
+    assert status.is_visible() and "40 surfels" in status.inner_text()
+    assert tab.page.locator("#head").inner_text() == "Two & <three>"
+    tab.page.click("#link")
+    tab.wait("!document.getElementById('announce').classList.contains('unseen')")
+    box = note.bounding_box()
+    assert "link" in note.inner_text() and box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["height"] > 20
+    tab.wait("document.getElementById('announce').classList.contains('unseen')", seconds=10.0)
+    assert not tab.errors
+
+
 def header_of(content: bytes) -> dict[str, Any]:
     header: dict[str, Any] = json.loads(content[16 : 16 + struct.unpack("<I", content[12:16])[0]])
     return header
@@ -273,6 +314,7 @@ def test_damaged_files_give_one_line(tab, site):
         (BAKED_FILE, b"GIF89a" + good[6:], "expected NXWBAKED at the start"),
         (BAKED_FILE, rebuilt(good, surfels=41), "expected the sections that the header describes"),
         (BAKED_FILE, rebuilt(good, atlas=picture), "atlas: expected a picture's file"),
+        (BAKED_FILE, rebuilt(good, radius=0), "radius: expected a number above 0"),
         (BAKED_FILE, rebuilt(good, sh_ranges=[1]), "sh_ranges: expected three numbers"),
         (ATLAS_FILE, b"no picture", "expected a picture"),
         (BAKED_FILE, inflated(good), "expected sections that unpack to at most 134"),

@@ -34,6 +34,8 @@ def test_a_full_file_holds_every_bit():
     expected, (header, arrays) = scene_arrays(model), read_sections(content_of("full"))
     for name in ("means", "quats", "scales", "opacities", "gammas", "limits", "sh"):
         np.testing.assert_array_equal(arrays[name], expected[name])
+    distances = np.linalg.norm(arrays["means"] - np.array(header["center"]), axis=1)
+    assert (distances < header["radius"]).sum() == len(distances) // 2
     assert header["options"]["background"] == list(model.options.background)
     assert isinstance(model.texture, nw.NeuralTexture)
     np.testing.assert_array_equal(arrays["grid"], model.texture.grid.detach().numpy())

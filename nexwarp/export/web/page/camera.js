@@ -3,6 +3,7 @@
 const TAU = 2 * Math.PI;
 const STEEPEST = TAU / 4 - 0.01;
 export const FOV = [15, 110]; // vertical, degrees
+const NARROWEST = 0.4; // share of the focal length that is left in a narrow window
 
 export const add = (a, b, s = 1) => a.map((x, i) => x + s * b[i]);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -27,8 +28,9 @@ export class Pose {
         Object.assign(this, {basis, eye, yaw, pitch, roll, fov, distance, offset, aspect, shape});
     }
 
-    // The pose of a camera of the scene; `distance` from the eye to the point to orbit around.
-    static of(basis, {viewmat: m, K: [fx, fy, cx, cy], width, height}, center) {
+    // The pose of a camera of the scene; `distance` from the eye to the point to orbit around, `shape` that of the part
+    // of the photo that a window has to show: all of its height, and its width as far as the subject reaches.
+    static of(basis, {viewmat: m, K: [fx, fy, cx, cy], width, height}, {center, radius}) {
         const eye = [0, 1, 2].map(i => -(m[i] * m[3] + m[4 + i] * m[7] + m[8 + i] * m[11]));
         const forward = m.slice(8, 11), right = m.slice(0, 3);
         const pitch = Math.asin(clamp(dot(forward, basis.up), -1, 1));
@@ -39,7 +41,9 @@ export class Pose {
         const distance = ahead > 1e-6 ? ahead : Math.max(Math.hypot(...add(center, eye, -1)), 1e-3);
         const fov = (2 * Math.atan(height / 2 / fy) * 360) / TAU;
         const offset = [(cx - width / 2) / height, (cy - height / 2) / height];
-        return new Pose(basis, {eye, yaw, pitch, roll, fov, distance, offset, aspect: fx / fy, shape: width / height});
+        const photo = width / height, subject = (radius ?? Infinity) / distance / (height / 2 / fy);
+        const shape = clamp(subject, Math.min(photo, 1), photo);
+        return new Pose(basis, {eye, yaw, pitch, roll, fov, distance, offset, aspect: fx / fy, shape});
     }
 
     axes() {
@@ -100,11 +104,11 @@ export class Pose {
         return new Pose(this.basis, {...numbers, eye, offset, yaw: this.yaw + turn * t});
     }
 
-    // Vertical focal length in pixels. A narrow window, such as a phone's, shows more above and below than the scene's
-    // cameras did, and less at the sides.
+    // Vertical focal length in pixels. A narrow window, such as a phone's, shows the subject from side to side, and more
+    // above and below than the scene's cameras did.
     focal(width, height) {
         const narrow = Math.min(width / height / this.shape, 1);
-        return (height / 2 / Math.tan((this.fov * TAU) / 720)) * Math.max(Math.sqrt(narrow), 0.5);
+        return (height / 2 / Math.tan((this.fov * TAU) / 720)) * Math.max(narrow, NARROWEST);
     }
 
     // The camera of an image of width x height pixels, as renderers take it.

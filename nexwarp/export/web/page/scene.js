@@ -99,7 +99,7 @@ function checkExposures(exposures) {
     }
 }
 
-function checkCameras({ cameras, start, center, up, near, bounds }) {
+function checkCameras({ cameras, start, center, radius, up, near, bounds }) {
     expect(Array.isArray(cameras) && cameras.length <= 1000, "cameras: expected a list of at most 1000");
     for (const camera of cameras) {
         const good =
@@ -119,6 +119,7 @@ function checkCameras({ cameras, start, center, up, near, bounds }) {
     expect(areNumbers([near], 1, 0, 1e16), "near: expected a number");
     const points = Array.isArray(bounds) && bounds.length === 2 && bounds.every((point) => areNumbers(point, 3));
     expect(points, "bounds: expected two points");
+    expect(radius === null || (areNumbers([radius], 1) && radius > 0), "radius: expected a number above 0");
 }
 
 function checkBaked({ atlas, sh_coefficients: coefficients, sh_ranges: ranges }) {
@@ -288,7 +289,7 @@ export class SceneReader {
         } catch (error) {
             throw error instanceof SceneError ? error : new SceneError("scene file: expected a JSON header");
         }
-        header = isObject(header) ? { texture: null, exposures: null, ...header } : header;
+        header = isObject(header) ? { texture: null, exposures: null, radius: null, ...header } : header;
         checkHeader(header);
         this.kind.check(header);
         this.base = 16 + length;

@@ -21,6 +21,7 @@ const MODES = {
 const SOFTWARE = /swiftshader|llvmpipe|basic render/i; // adapters that are no GPU: the baked scene is faster there
 const FLIGHT_MILLISECONDS = 700; // from one camera to another
 const LINK_MILLISECONDS = 400; // after the last change, before the address follows
+const NOTE_MILLISECONDS = 3000; // that a note is shown
 const LARGEST_RATIO = 2; // canvas pixels to CSS pixels
 
 const element = id => document.getElementById(id);
@@ -146,7 +147,7 @@ class Viewer {
         this.cameras = header.cameras;
         this.basis = basisOf(header.up);
         const camera = this.cameras[header.start] ?? null;
-        this.start_ = camera ? Pose.of(this.basis, camera, header.center) : this.#overview(header);
+        this.start_ = camera ? Pose.of(this.basis, camera, header) : this.#overview(header);
         this.near = camera?.near ?? header.near;
         this.index = header.start;
         this.#pose = this.start_;
@@ -216,7 +217,7 @@ class Viewer {
         this.index = ((index % count) + count) % count;
         element("camera").value = String(this.index);
         const camera = this.cameras[this.index];
-        this.#flyTo(Pose.of(this.basis, camera, this.renderer.header.center), `Camera ${camera.name}.`);
+        this.#flyTo(Pose.of(this.basis, camera, this.renderer.header), `Camera ${camera.name}.`);
     }
 
     setMode(mode) {
@@ -358,7 +359,9 @@ class Viewer {
 
     #announce(text, visible = false) {
         element("announce").textContent = text;
-        if (visible) element("status").textContent = text;
+        element("announce").classList.toggle("unseen", !visible);
+        clearTimeout(this.noting);
+        if (visible) this.noting = setTimeout(() => element("announce").classList.add("unseen"), NOTE_MILLISECONDS);
     }
 
     #lost(reason) {
