@@ -6,31 +6,11 @@ import warp as wp
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.kernels.shape import alpha_at
-from nexwarp.kernels.surfel import hit
-from nexwarp.kernels.types import ALPHA_MIN, types
-from nexwarp.kernels.walk import HALF_HEIGHT, HALF_WIDTH, misses_block
+from nexwarp.kernels.types import types
+from tests.warp_kernels import FOCAL, HEIGHT, NEAR, WIDTH, visit_blocks
 
 T = types(wp.float32)
-FOCAL, WIDTH, HEIGHT, NEAR = 60.0, 80, 56, 0.01
 BLOCKS = (WIDTH // 8) * (HEIGHT // 4)
-
-
-@wp.kernel(enable_backward=False)
-def visit(surfels: T.Surfels, culled: wp.array2d(dtype=wp.int32), hits: wp.array2d(dtype=wp.int32)):
-    """Whether each block culls each surfel, and how many of its 32 pixels hit it."""
-    i, block = wp.tid()
-    x = float(block % (WIDTH // 8)) * 8.0 - float(WIDTH // 2)
-    y = float(block // (WIDTH // 8)) * 4.0 - float(HEIGHT // 2)
-    middle = wp.vec2((x + 4.0) / FOCAL, (y + 2.0) / FOCAL)
-    if misses_block(i, surfels, middle, wp.vec2(float(HALF_WIDTH) / FOCAL, float(HALF_HEIGHT) / FOCAL)):
-        culled[i, block] = 1
-    r = surfels.records
-    for p in range(32):
-        d = wp.vec2((x + float(p % 8) + 0.5) / FOCAL, (y + float(p // 8) + 0.5) / FOCAL)
-        u, v, depth = hit(r[i, 0], r[i, 1], r[i, 2], r[i, 3][3], d)
-        if alpha_at(u, v, r[i, 0][3], r[i, 1][3], r[i, 2][3]) >= ALPHA_MIN and depth > NEAR:
-            hits[i, block] += 1
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -49,13 +29,13 @@ def test_no_block_culls_what_one_of_its_pixels_hits(seed: int) -> None:
     shape = [x.detach() for x in surfels.activated()]
     K = torch.tensor([[FOCAL, 0.0, WIDTH / 2], [0.0, FOCAL, HEIGHT / 2], [0.0, 0.0, 1.0]])
     viewmat = torch.eye(4)
-    projection = ops.project(*shape, torch.zeros(count, 3), viewmat)
+    projection = ops.project(*[*shape, torch.zeros(count, 3), viewmat])
     tiles = ops.intersect_tiles(shape, projection, viewmat, ops.Pinhole(K, WIDTH, HEIGHT, NEAR))
     argument = T.Surfels()
     argument.records = wp.from_torch(projection.records, dtype=T.vec4)
     argument.limits, argument.reaches = wp.from_torch(projection.limits), wp.from_torch(tiles.reaches, dtype=T.vec2)
     culled, hits = (wp.zeros((count, BLOCKS), dtype=wp.int32, device="cpu") for _ in range(2))
-    wp.launch(visit, (count, BLOCKS), [argument], [culled, hits], device="cpu")
+    wp.launch(visit_blocks, (count, BLOCKS), [argument], [culled, hits], device="cpu")
     spared, hit_pixels = culled.numpy().astype(bool), hits.numpy()
     assert hit_pixels.any() and not hit_pixels[spared].any()
     assert spared.sum() > 0.95 * (hit_pixels == 0).sum()

@@ -104,7 +104,7 @@ def test_projection_takes_quaternions_of_any_length(device: torch.device) -> Non
     quats = (scene["quats"] * torch.linspace(0.01, 100, 100, device=device)[:, None]).requires_grad_()
     rest = [scene[name] for name in ("scales", "opacities", "gammas")] + [scene["means"]]
     actual, expected = (
-        ops.project(scene["means"], x, *rest, scene["viewmat"]).records
+        ops.project(*[scene["means"], x, *rest, scene["viewmat"]]).records
         for x in (quats, torch.nn.functional.normalize(quats, dim=-1))
     )
     assert_close(actual, expected, kind="value", name="records")
