@@ -1,5 +1,6 @@
 """Display of progress and results: live lines in a terminal, occasional lines in a log file."""
 
+import math
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -21,10 +22,47 @@ from rich.table import Table
 
 from nexwarp.io.files import printable
 from nexwarp.run.log import peak_memory
-from nexwarp.train.report import StepReport, TimeLeft
+from nexwarp.train.report import StepReport
 
 REFRESH_SECONDS = 0.5
 LOG_LINES = 20
+RECENT = 30.0  # seconds after which a speed counts a third in the estimate of the time left
+
+
+class TimeLeft:
+    """How long a run takes on: the work that is left, counted in training steps, over its recent speed; and an end.
+
+    Attributes:
+        work: that is left, of all trainings of the run.
+        end: seconds that follow all of it.
+    """
+
+    def __init__(self, work: float = 0.0, end: float = 0.0, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.work, self.end, self.clock = work, end, clock
+        self.last = clock()
+        self.recent_work = self.recent_seconds = 0.0
+
+    def spend(self, work: float) -> None:
+        """Note what was done since the last call; negative where a training went back."""
+        now = self.clock()
+        passed = now - self.last
+        kept = math.exp(-passed / RECENT)
+        self.recent_work = max(kept * self.recent_work + work, 0.0)
+        self.recent_seconds = kept * self.recent_seconds + passed
+        self.last, self.work = now, max(self.work - work, 0.0)
+
+    def seconds(self) -> float:
+        """Return the estimate, which needs some work done, or none left."""
+        if not self.work:
+            return self.end
+        return self.end + self.work * self.recent_seconds / max(self.recent_work, 1e-9)
+
+    def __str__(self) -> str:
+        seconds = self.seconds()
+        if seconds < 100:
+            return f"{seconds:.0f} s left in all"
+        minutes = round(seconds / 60)
+        return f"{minutes} min left in all" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min left in all"
 
 
 def device_name(device: torch.device) -> str:

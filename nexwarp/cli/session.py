@@ -39,8 +39,8 @@ from nexwarp.run.folder import (
 from nexwarp.run.log import TrainingLog
 from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
-from nexwarp.train.report import StepReport, TimeLeft
-from nexwarp.train.stages import RENDERED, Stage, StageStore, divide
+from nexwarp.train.report import StepReport
+from nexwarp.train.stages import VIEW_COST, Stage, StageStore, divide
 from nexwarp.train.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class Session(StageStore):
     every: int | None = None  # iterations between checkpoints; None saves ten a stage
     viewer: "Viewer | None" = None
     seconds: float = 0.0  # that complete teachers took
-    left: TimeLeft = field(default_factory=TimeLeft)  # of all stages and the evaluation
+    left: display.TimeLeft = field(default_factory=display.TimeLeft)  # of all stages and the evaluation
     begun: bool = False
 
     def complete(self, stage: Stage) -> Model | None:
@@ -101,8 +101,8 @@ class Session(StageStore):
             photos, tests = len(trainer.scene.train), trainer.scene.test
             coming = [s for s in divide(self.record.config, self.record.own) if s.before >= stage.before]
             pixels = sum(view.camera.width * view.camera.height for view in tests)
-            work = sum(s.work(photos) for s in coming) + RENDERED * len(tests)
-            self.left = TimeLeft(work - trainer.iteration, JUDGED * pixels)
+            work = sum(s.work(photos) for s in coming) + VIEW_COST * len(tests)
+            self.left = display.TimeLeft(work - trainer.iteration, JUDGED * pixels)
         self.begun = True
 
     def train(self, stage: Stage, trainer: Trainer) -> None:
@@ -204,7 +204,7 @@ class Session(StageStore):
         with display.stages(self.console, self.left) as show:
 
             def observe(name: str, done: int, total: int) -> None:
-                self.left.spend(RENDERED)
+                self.left.spend(VIEW_COST)
                 show(name, done, total)
 
             finished = trainer.finish(observe)

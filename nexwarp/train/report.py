@@ -1,16 +1,13 @@
-"""What a training reports: its steps, the time it takes on, numbers that are not finite, lacking memory."""
+"""What a training step reports, and the health of a training: numbers that are not finite, lacking memory."""
 
 import math
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 
 from nexwarp.errors import DivergedError
 from nexwarp.train.state import TrainingState
-
-RECENT = 30.0  # seconds after which a speed counts a third in the estimate of the time left
 
 
 @dataclass(frozen=True)
@@ -45,42 +42,6 @@ class StepReport:
         """Return the PSNR of the step's training view in dB, from unrounded values."""
         error = (self.image.detach().clamp(0, 1) - self.target).square().mean()
         return -10.0 * math.log10(max(error.item(), 1e-10))
-
-
-class TimeLeft:
-    """How long a run takes on: the work that is left, counted in training steps, over its recent speed; and an end.
-
-    Attributes:
-        work: that is left, of all trainings of the run.
-        end: seconds that follow all of it.
-    """
-
-    def __init__(self, work: float = 0.0, end: float = 0.0, clock: Callable[[], float] = time.perf_counter) -> None:
-        self.work, self.end, self.clock = work, end, clock
-        self.last = clock()
-        self.recent_work = self.recent_seconds = 0.0
-
-    def spend(self, work: float) -> None:
-        """Note what was done since the last call; negative where a training went back."""
-        now = self.clock()
-        passed = now - self.last
-        kept = math.exp(-passed / RECENT)
-        self.recent_work = max(kept * self.recent_work + work, 0.0)
-        self.recent_seconds = kept * self.recent_seconds + passed
-        self.last, self.work = now, max(self.work - work, 0.0)
-
-    def seconds(self) -> float:
-        """Return the estimate, which needs some work done, or none left."""
-        if not self.work:
-            return self.end
-        return self.end + self.work * self.recent_seconds / max(self.recent_work, 1e-9)
-
-    def __str__(self) -> str:
-        seconds = self.seconds()
-        if seconds < 100:
-            return f"{seconds:.0f} s left in all"
-        minutes = round(seconds / 60)
-        return f"{minutes} min left in all" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min left in all"
 
 
 def check_health(

@@ -35,7 +35,7 @@ SHARE = 0.4  # of the iterations that the teachers have together
 TEACHER_SURFELS = 40_000
 TEACHER_TIMES = 4  # at most so many times the student's
 # A view that is rendered to finish a model costs this much of a training step: on two CPU cores a quarter.
-RENDERED = 0.25
+VIEW_COST = 0.25
 STREAM = 3  # series of seeds, as `derived_seed` counts them
 
 Observer = Callable[[StepReport], None]
@@ -77,7 +77,7 @@ class Stage:
     def work(self, photos: int) -> float:
         """Return what the training and the finishing of its model cost, in training steps."""
         passes = (self.config.smooth_sh > 0) + self.config.footprints
-        return self.config.iterations + RENDERED * passes * photos
+        return self.config.iterations + VIEW_COST * passes * photos
 
 
 def plan_teachers(config: Config, photos: int) -> OwnTeachers:

@@ -14,6 +14,7 @@ from rich.console import Console
 import nexwarp as nw
 from nexwarp import Config, Model, Scene, Trainer
 from nexwarp.cli import main as cli
+from nexwarp.cli.display import TimeLeft
 from nexwarp.cli.session import Session
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import OutOfMemoryError, SettingError
@@ -22,8 +23,8 @@ from nexwarp.train import trainer as trainer_module
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import TextureConfig
-from nexwarp.train.report import StepReport, TimeLeft
-from nexwarp.train.stages import RENDERED, OwnTeachers, StageRunner, divide, plan_teachers
+from nexwarp.train.report import StepReport
+from nexwarp.train.stages import VIEW_COST, OwnTeachers, StageRunner, divide, plan_teachers
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -390,11 +391,11 @@ def test_the_time_left_is_that_of_all_stages(tiny_scene: Scene, tmp_path: Path) 
     session = Session(run, record, Console(quiet=True), Ranks.alone(CPU))
     runner = StageRunner(tiny_scene, CONFIG, CPU, session, own=record.own)
     passes = (CONFIG.smooth_sh > 0) + CONFIG.footprints
-    assert session.left.work == CONFIG.iterations + RENDERED * (3 * passes * photos + tests)
+    assert session.left.work == CONFIG.iterations + VIEW_COST * (3 * passes * photos + tests)
     create_run(run, record)
     runner.train()
     runner.finish()
-    assert session.left.work == pytest.approx(RENDERED * tests)
+    assert session.left.work == pytest.approx(VIEW_COST * tests)
 
 
 def test_the_time_left_follows_the_recent_speed() -> None:
