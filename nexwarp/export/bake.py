@@ -39,7 +39,7 @@ FEWEST_STEPS, MOST_STEPS = 70, 800
 RATES = {"atlas": 0.02, "sh0": 5e-3, "shN": 2e-3}
 LAST_RATE = 0.1  # relative to the first
 
-Progress = Callable[[str, int, int], object]
+Progress = Callable[[str, int, int], object]  # name of a stage, how much of it is done, and of how much
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
@@ -12,6 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.errors import RunError, SettingError
+from nexwarp.export.bake import Progress
 from nexwarp.io.ply import write_elements
 from nexwarp.kernels.tsdf import BLOCK_SIDE
 from nexwarp.model.model import Model
@@ -26,8 +27,6 @@ LEAST_SHARE = 5e-4  # of all triangles: smaller components are removed
 MOST_BLOCKS = 2_000_000
 CORNERS = [(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)]  # of a cell; itself and its neighbours
 WELD = 1e4  # vertices that agree to a part of this many of a voxel are one
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)

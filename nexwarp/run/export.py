@@ -17,9 +17,9 @@ from nexwarp.data.images import image_size
 from nexwarp.data.scene import DEMO, SceneSource, demo_folder
 from nexwarp.data.transforms import lens_keys
 from nexwarp.errors import RunError, SettingError
-from nexwarp.export.bake import bake
+from nexwarp.export.bake import Progress, bake
 from nexwarp.export.glb import save_glb
-from nexwarp.export.mesh import Progress, extract_mesh, save_mesh
+from nexwarp.export.mesh import extract_mesh, save_mesh
 from nexwarp.export.splats import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_splats_spz, save_surfels_ply
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import JsonObject, write_json
