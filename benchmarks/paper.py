@@ -25,7 +25,7 @@ from nexwarp.errors import SettingError
 from nexwarp.run.evaluate import check_metrics
 
 INDOOR, OUTDOOR, TANKS, CUSTOM = GROUPS = ("Mip-NeRF 360 indoor", "Mip-NeRF 360 outdoor", "Tanks & Temples", "custom")
-SCENES = {  # group, folder and size of the paper's photos
+SCENES = {  # group, folder and size of the paper's photos; treehill's is inferred from photos of half the size
     "bonsai": (INDOOR, "images_2", "1559x1039"),
     "counter": (INDOOR, "images_2", "1558x1038"),
     "kitchen": (INDOOR, "images_2", "1558x1039"),

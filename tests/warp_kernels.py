@@ -51,7 +51,7 @@ def weighted_sum(
     wp.atomic_add(loss, 0, wp.dot(image[i], weights[i]))
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, module="unique")
 def visit_blocks(surfels: FLOAT32.Surfels, culled: wp.array2d(dtype=wp.int32), hits: wp.array2d(dtype=wp.int32)):
     """Whether each block culls each surfel, and how many of its 32 pixels hit it."""
     i, block = wp.tid()
