@@ -157,14 +157,16 @@ def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
 def lpips_vgg(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float | None:
     """LPIPS (VGG, v0.1) of two images as of `ssim`, at least 16 pixels a side; None, with one warning, without weights.
 
-    The weights come from $NEXWARP_LPIPS, the cache folder or the package `lpips` (docs/quality.md).
+    The weights come from $NEXWARP_LPIPS, the cache folder or the package `lpips` (docs/quality.md). It is computed on
+    the GPU where there is one.
     """
     x, y = _unit_images(image, target, mask)
-    distance = _lpips_distance(x.device)
+    device = torch.device("cuda") if torch.cuda.is_available() else x.device
+    distance = _lpips_distance(device)
     if distance is None:
         return None
-    with torch.no_grad():
-        return distance(x, y).item()
+    with torch.no_grad(), torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
+        return distance(x.to(device), y.to(device)).item()
 
 
 def flip(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float | None:
@@ -205,7 +207,7 @@ def check_metrics(metrics: Sequence[str], device: torch.device) -> None:
 def _load_lpips(device: torch.device) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
     """Return LPIPS as a function of two (H, W, 3) images in [0, 1]."""
     if (file := weights_file()).is_file():
-        return load_vgg(file)
+        return load_vgg(file, device)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torchvision deprecates the arguments that lpips passes
@@ -278,16 +280,16 @@ class VGG(torch.nn.Module):
             if block > 0:
                 features = max_pool2d(features, 2)
             for layer in layers:
-                weight, bias = (self.weights[f"{layer}.{name}"].to(features.device) for name in ("weight", "bias"))
+                weight, bias = (self.weights[f"{layer}.{name}"] for name in ("weight", "bias"))
                 features = conv2d(features, weight, bias, padding=1).relu()
             first, second = normalize(features, eps=1e-10)
-            head = self.weights[f"lin{block}"].to(features.device)
-            distance = distance + ((first - second).square() * head[:, None, None]).sum(0).mean()
+            head = self.weights[f"lin{block}"][:, None, None]
+            distance = distance + ((first - second).square() * head).sum(0).mean()
         return distance
 
 
-def load_vgg(file: Path) -> VGG:
-    """Read the network from a file of `python -m benchmarks.lpips_weights`."""
+def load_vgg(file: Path, device: torch.device | str = "cpu") -> VGG:
+    """Read the network, for pictures on a device, from a file of `python -m benchmarks.lpips_weights`."""
     try:
         check_tensors_header(file)
         weights = load_file(file)
@@ -297,4 +299,4 @@ def load_vgg(file: Path) -> VGG:
     expected |= {f"lin{block}" for block in range(len(BLOCKS))}
     if missing := sorted(expected - weights.keys()):
         raise FormatError(f"{file}: expected the weights of LPIPS with VGG-16, {missing[0]} is missing")
-    return VGG(weights)
+    return VGG({name: values.to(device) for name, values in weights.items()})
