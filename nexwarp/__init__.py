@@ -34,6 +34,7 @@ from nexwarp.cameras.paths import ellipse
 from nexwarp.cameras.ray_camera import RayCamera
 from nexwarp.cli import __version__ as __version__
 from nexwarp.data import Scene, View, load_scene
+from nexwarp.export.baked_scene import BakedScene, load_baked
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
@@ -51,6 +52,7 @@ from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
 
 __all__ = [
+    "BakedScene",
     "Camera",
     "Config",
     "DensityControl",
@@ -72,6 +74,7 @@ __all__ = [
     "compose",
     "ellipse",
     "load",
+    "load_baked",
     "load_cameras",
     "load_scene",
     "preset",

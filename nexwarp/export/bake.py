@@ -17,7 +17,7 @@ from nexwarp.errors import FormatError
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.model.model import Model
 from nexwarp.model.render import Rendering
-from nexwarp.model.surfels import Surfels
+from nexwarp.model.surfels import Activated, Surfels
 from nexwarp.model.texture import NeuralTexture
 
 # Hits below this blending weight do not decide where a surfel has a texture: of 255 grey levels they change 4 at most.
@@ -149,7 +149,7 @@ def bake(
     return fit(baked, cameras, steps, partial(progress, "baking the texture"))
 
 
-def axes(surfels: Surfels) -> tuple[torch.Tensor, torch.Tensor]:
+def axes(surfels: Surfels | Activated) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the surfels' unit x and y axes, (N, 3) each, world frame."""
     w, x, y, z = surfels.quats.detach().unbind(-1)
     across = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
@@ -157,7 +157,7 @@ def axes(surfels: Surfels) -> tuple[torch.Tensor, torch.Tensor]:
     return across, along
 
 
-def points_on(surfels: Surfels, ids: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
+def points_on(surfels: Surfels | Activated, ids: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
     """Return points (..., 3), world frame, at offsets (..., 2) [world units] along the axes of surfels (...)."""
     ways = zip(offsets.unbind(-1), axes(surfels), strict=True)
     return surfels.means.detach()[ids] + sum(x[..., None] * axis[ids] for x, axis in ways)

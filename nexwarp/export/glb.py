@@ -3,7 +3,6 @@
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,45 +10,83 @@ import torch
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import up_direction
 from nexwarp.errors import FormatError
-from nexwarp.export.bake import Baked, Layout, lay_out, points_on
+from nexwarp.export.bake import Baked, lay_out, points_on
+from nexwarp.export.baked_scene import BakedScene, Header, card_scene
 from nexwarp.io.files import write_atomically
 from nexwarp.io.pictures import to_uint8
 from nexwarp.kernels.types import ALPHA_MAX
+from nexwarp.ops.atlas import Cut
 
-# Programs draw where the texture's alpha is at least this, and nothing elsewhere: they need not sort the quads.
+ALPHAS = ("mask", "blend")
+# Cut-outs: programs draw where the texture's alpha is at least this, and nothing elsewhere: they need not sort.
 CUTOFF = 0.3
 # The quads end where alpha falls to this: bilinear sampling needs what lies beyond the cut-off.
-LEAST_ALPHA = 0.5 * CUTOFF
+LEAST_ALPHA = {"mask": 0.5, "blend": 0.05}  # of the cut-off
 FEWEST = 8  # texels along an axis: alpha varies over every quad
 
 
 @torch.no_grad()
-def save_glb(path: str | os.PathLike[str], baked: Baked, cameras: Sequence[Camera]) -> None:
-    """Write a baked scene as a glTF 2.0 binary file, atomically: unlit quads with one texture of colours and alpha.
+def make_cards(baked: Baked, alpha: str = "mask") -> BakedScene:
+    """Return a baked scene as cards, for `save_glb`: cut out ("mask") or blended ("blend").
 
-    Colours are those at the mean exposure from the direction in which the views see each surfel. The mean of the
-    cameras' upward directions becomes +y. FormatError: no surfel is opaque enough to be seen.
+    Colours are those at the mean exposure from the direction in which the views see each surfel.
+    """
+    surfels = baked.surfels
+    least = LEAST_ALPHA[alpha] * CUTOFF
+    opacities, gammas = surfels.opacities.clamp(max=ALPHA_MAX), surfels.gammas
+    # |u|^(2 gamma) = 2 log(opacity / alpha) at the end of the quad.
+    reach = (2 * (opacities / least).clamp_min(1).log())[:, None].pow(0.5 / gammas)
+    shown = opacities > (CUTOFF if alpha == "mask" else 2 * least)
+    layout = lay_out(torch.cat([-reach, reach], dim=1).where(shown[:, None], 0.0), baked.seen.pixels, fewest=FEWEST)
+    plain = baked.mean_colors()
+    texels = reach.new_zeros(layout.height, layout.width, 4)
+    for places, ids, local in layout.centres():
+        colors = plain[ids] + baked.added(ids, local)
+        exponent = local.square().clamp_min(1e-20).pow(gammas[ids]).sum(1)
+        alphas = (surfels.opacities[ids] * torch.exp(-0.5 * exponent)).clamp(max=ALPHA_MAX)
+        texels[places[:, 1], places[:, 0]] = torch.cat([colors.clamp(0, 1), alphas[:, None]], dim=1)
+    ids = layout.textured()
+    rects = layout.rects[ids].float()
+    scales = surfels.scales[ids] * reach[ids]
+    cut = Cut(CUTOFF) if alpha == "mask" else None
+    return card_scene(
+        (surfels.means[ids], surfels.quats[ids], scales),
+        texels,
+        torch.cat([rects[:, :2], rects[:, 2:] - 1], dim=1),
+        cut,
+    )
+
+
+@torch.no_grad()
+def save_glb(path: str | os.PathLike[str], scene: BakedScene, cameras: Sequence[Camera]) -> None:
+    """Write cards as a glTF 2.0 binary file, atomically: unlit quads with one texture of colours and alpha.
+
+    The mean of the cameras' upward directions becomes +y, by the mesh's node: the vertices stay in the cameras' frame.
+    FormatError: there are no cards, as no surfel is opaque enough to be seen.
     """
     import trimesh
     from PIL import Image
     from trimesh.exchange.gltf import export_glb
 
-    layout, pixels = _texture(baked)
-    if not len(layout.textured()):
+    if not len(scene.shape.means):
         raise FormatError(f"{path}: expected surfels with an opacity above {CUTOFF}, which glTF shows; found none")
-    corners, places, faces = _quads(baked, layout)
+    corners, places, faces = _quads(scene)
+    mode = {"alphaMode": "BLEND"} if scene.cut is None else {"alphaMode": "MASK", "alphaCutoff": scene.cut.cutoff}
     material = trimesh.visual.material.PBRMaterial(
         name="surfels",
-        baseColorTexture=Image.fromarray(pixels, "RGBA"),
+        baseColorTexture=Image.fromarray(to_uint8(scene.texels).cpu().numpy(), "RGBA"),
         metallicFactor=0.0,
         roughnessFactor=1.0,
-        alphaMode="MASK",
-        alphaCutoff=CUTOFF,
         doubleSided=True,
+        **mode,
     )
     visual = trimesh.visual.TextureVisuals(uv=places, material=material)
-    mesh = trimesh.Trimesh(vertices=corners @ upright(cameras).T, faces=faces, visual=visual, process=False)
-    write_atomically(Path(path), export_glb(trimesh.Scene(mesh), tree_postprocessor=_unlit))
+    mesh = trimesh.Trimesh(vertices=corners, faces=faces, visual=visual, process=False)
+    turn = np.eye(4)
+    turn[:3, :3] = upright(cameras)
+    world = trimesh.Scene()
+    world.add_geometry(mesh, transform=turn)
+    write_atomically(Path(path), export_glb(world, tree_postprocessor=_unlit))
 
 
 def upright(cameras: Sequence[Camera]) -> np.ndarray:
@@ -60,43 +97,21 @@ def upright(cameras: Sequence[Camera]) -> np.ndarray:
     return np.stack([side, up, np.cross(side, up)])
 
 
-def _texture(baked: Baked) -> tuple[Layout, np.ndarray]:
-    """Return a layout of the surfels' visible parts, and its texels (height, width, 4) uint8, RGBA."""
-    surfels = baked.surfels
-    opacities, gammas = surfels.opacities.clamp(max=ALPHA_MAX), surfels.gammas
-    # |u|^(2 gamma) = 2 log(opacity / alpha) at the end of the quad.
-    reach = (2 * (opacities / LEAST_ALPHA).clamp_min(1).log())[:, None].pow(0.5 / gammas)
-    boxes = torch.cat([-reach, reach], dim=1).where((opacities > CUTOFF)[:, None], 0.0)
-    layout = lay_out(boxes, baked.seen.pixels, fewest=FEWEST)
-    plain = baked.mean_colors()
-    pixels = np.zeros((layout.height, layout.width, 4), np.uint8)
-    for places, ids, local in layout.centres():
-        colors = plain[ids] + baked.added(ids, local)
-        exponent = local.square().clamp_min(1e-20).pow(gammas[ids]).sum(1)
-        alphas = (surfels.opacities[ids] * torch.exp(-0.5 * exponent)).clamp(max=ALPHA_MAX)
-        columns, rows = places.cpu().numpy().T
-        pixels[rows, columns] = to_uint8(torch.cat([colors, alphas[:, None]], dim=1)).cpu().numpy()
-    return layout, pixels
-
-
-def _quads(baked: Baked, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _quads(scene: BakedScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return corners (4 M, 3) in the world, their texture coordinates (4 M, 2) from the bottom left, faces (2 M, 3)."""
-    surfels = baked.surfels
-    ids = layout.textured()
-    boxes, rects = layout.boxes[ids], layout.rects[ids].double()
-    sides = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], device=boxes.device)
-    local = boxes[:, None, :2] + sides * (boxes[:, None, 2:] - boxes[:, None, :2])
-    offsets = local * surfels.scales.detach()[ids, None]
-    corners = points_on(surfels, ids[:, None], offsets)
-    size = torch.tensor([layout.width, layout.height], device=boxes.device)
-    places = (rects[:, None, :2] + 0.5 + sides * (rects[:, None, 2:] - 1)) / size
+    shape, rects = scene.shape, scene.rects.double()
+    sides = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], device=rects.device)
+    offsets = (2 * sides - 1) * shape.scales[:, None]
+    corners = points_on(shape, torch.arange(len(rects), device=rects.device)[:, None], offsets)
+    size = torch.tensor([scene.texels.shape[1], scene.texels.shape[0]], device=rects.device)
+    places = (rects[:, None, :2] + 0.5 + sides * rects[:, None, 2:]) / size
     places[..., 1] = 1 - places[..., 1]
-    first = 4 * np.arange(len(ids))[:, None]
+    first = 4 * np.arange(len(rects))[:, None]
     faces = np.concatenate([first + np.array(corner) for corner in ((0, 1, 2), (0, 2, 3))])
     return corners.reshape(-1, 3).double().cpu().numpy(), places.reshape(-1, 2).cpu().numpy(), faces
 
 
-def _unlit(tree: dict[str, Any]) -> None:
+def _unlit(tree: Header) -> None:
     """Make the material show its texture as it is, without light and without coarser levels of the texture."""
     for material in tree["materials"]:
         material["extensions"] = {"KHR_materials_unlit": {}}

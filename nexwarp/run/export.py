@@ -18,7 +18,7 @@ from nexwarp.data.scene import DEMO, SceneSource, demo_folder
 from nexwarp.data.transforms import lens_keys
 from nexwarp.errors import RunError, SettingError
 from nexwarp.export.bake import Progress, bake
-from nexwarp.export.glb import save_glb
+from nexwarp.export.glb import ALPHAS, make_cards, save_glb
 from nexwarp.export.mesh import extract_mesh, save_mesh
 from nexwarp.export.splats import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_splats_spz, save_surfels_ply
 from nexwarp.io.files import one_line
@@ -42,6 +42,8 @@ class ExportOrder:
     """Output folder; with --format web also NAME.html, for one file with everything."""
     quality: Annotated[str, arg(metavar="{quantised,full}")] = "quantised"
     """Of --format web: quantised files are a fifth to a half as large."""
+    alpha: Annotated[str, arg(metavar="{mask,blend}")] = "mask"
+    """Of glb: mask cuts surfels out, which all programs draw; blend is closer to the photos, in those that sort."""
     noise: Annotated[float | None, arg(metavar="X", help_behavior_hint="(default: 8 % of the test views' error)")] = (
         None
     )
@@ -63,6 +65,8 @@ class ExportOrder:
             raise SettingError(f"--noise: expected {NOISES[0]:g} to {NOISES[1]:g}, got {self.noise:g}")
         if self.format not in EXPORTS:
             raise SettingError(f"--format: expected one of {', '.join(EXPORTS)}, got {self.format!r}")
+        if self.alpha not in ALPHAS:
+            raise SettingError(f"--alpha: expected {' or '.join(ALPHAS)}, got {self.alpha!r}")
         if self.format != "mesh" and (self.voxel is not None or self.far is not None):
             raise SettingError(f"--voxel, --far: expected together with --format mesh, got --format {self.format}")
         package, extra = PACKAGES.get(self.format, ("torch", ""))
@@ -118,7 +122,7 @@ def _export(
         if not views:
             raise RunError(f"{opened.path}: --format glb: expected the run's {CAMERAS_FILE}, found none")
         cameras = list(views.values())
-        save_glb(files[0], bake(opened.model.to(device), cameras, progress=observe), cameras)
+        save_glb(files[0], make_cards(bake(opened.model.to(device), cameras, progress=observe), order.alpha), cameras)
     else:
         surfels, degree = opened.model.surfels, min(opened.model.options.sh_degree, SPLAT_DEGREE)
         if order.format == "ply":

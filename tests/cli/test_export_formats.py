@@ -29,7 +29,6 @@ def test_a_finished_run_becomes_gltf_and_spz(finished, monkeypatch, capsys):
     refused(capsys, ["export", str(finished), "--format", "glb", "--device", "cpu"], "scene.glb", "opacity above 0.3")
     assert not (finished / "export").exists()
     monkeypatch.setattr("nexwarp.export.glb.CUTOFF", 0.05)  # surfels of a short training are faint
-    monkeypatch.setattr("nexwarp.export.glb.LEAST_ALPHA", 0.025)
     for package, kind, name in (("trimesh", "glb", "scene.glb"), ("gaussforge", "spz", "splats.spz")):
         pytest.importorskip(package)
         assert cli.main(["export", str(finished), "--format", kind, "--device", "cpu"]) == 0

@@ -142,7 +142,7 @@ docstrings, which `help(nw.render)` shows, too.
 """
 # Titles, and the rooms of the package whose names stand below them.
 ROOMS = {
-    "Models and rendering": ("model", "ops", "kernels"),
+    "Models and rendering": ("model", "ops", "kernels", "export"),
     "Cameras": ("cameras",),
     "Scenes": ("data", "io"),
     "Training": ("train", "run", "cli"),

@@ -10,7 +10,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.export.bake import Baked, bake, evaluate, lay_out, observe
-from nexwarp.export.glb import CUTOFF, save_glb, upright
+from nexwarp.export.glb import CUTOFF, make_cards, save_glb, upright
 from nexwarp.export.splats import save_splats_spz
 from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE, encode_atlas, encode_baked, encode_harmonics
 from tests.export.web import support
@@ -107,18 +107,20 @@ def test_a_gpu_bakes_what_the_cpu_bakes(model, baked, cameras, tmp_path):
         assert psnr(rendered(as_stored(there), camera).cpu(), rendered(as_stored(baked), camera)) > 35
     assert encode_baked(there, cameras).keys() == {BAKED_FILE, ATLAS_FILE}
     pytest.importorskip("trimesh")
-    save_glb(tmp_path / "scene.glb", there, views)
+    save_glb(tmp_path / "scene.glb", make_cards(there), views)
 
 
 def test_the_gltf_file_holds_the_surfels(baked, cameras, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     file = tmp_path / "scene.glb"
-    save_glb(file, baked, list(cameras.values()))
-    (mesh,) = trimesh.load(file).geometry.values()
+    save_glb(file, make_cards(baked), list(cameras.values()))
+    read = trimesh.load(file)
+    (mesh,) = read.geometry.values()
     visible = (baked.surfels.opacities > CUTOFF).nonzero()[:, 0]
     assert mesh.vertices.shape == (4 * len(visible), 3) and mesh.faces.shape == (2 * len(visible), 3)
-    turn = upright(list(cameras.values()))
-    back = torch.from_numpy(np.asarray(mesh.vertices) @ turn).float().reshape(-1, 4, 3)
+    turn = read.graph.get(read.graph.nodes_geometry[0])[0]
+    assert np.allclose(turn[:3, :3], upright(list(cameras.values()))) and not turn[:3, 3].any()
+    back = torch.from_numpy(np.asarray(mesh.vertices)).float().reshape(-1, 4, 3)
     surfels = baked.surfels
     across = (back - surfels.means[visible, None]) @ surfels.normals[visible, :, None]
     assert float(across.detach().abs().max()) < 1e-4, "corners lie in the surfels' planes"

@@ -24,7 +24,11 @@ from nexwarp.data.images import read_image, read_mask, read_transparent
 from nexwarp.data.ply import read_ply
 from nexwarp.data.scene import SceneSource
 from nexwarp.data.sfm.photos import MAKE, MODEL, camera_groups, read_photos
+from nexwarp.export.bake import bake
+from nexwarp.export.baked_scene import load_baked
+from nexwarp.export.glb import make_cards, save_glb
 from nexwarp.export.splats import save_splats_ply
+from nexwarp.export.web.baked import encode_baked
 from nexwarp.io.json_files import write_json
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.exposures import Exposures
@@ -268,6 +272,20 @@ def _photo_files(folder: Path) -> list[Files]:
     return [{"a.jpg": data} for data in _files(folder).values()]
 
 
+def _baked(folder: Path) -> list[Files]:
+    model, views = _some_model(folder / "scene"), _cameras(folder / "views")
+    baked = bake(model, list(views.values()), steps=1)
+    save_glb(folder / "scene.glb", make_cards(baked, "blend"), list(views.values()))
+    _read_baked(folder)
+    return [encode_baked(baked, views), {"scene.glb": (folder / "scene.glb").read_bytes()}]
+
+
+def _read_baked(folder: Path) -> None:
+    scene = load_baked(folder / "scene.glb" if (folder / "scene.glb").is_file() else folder)
+    camera = dataclasses.replace(make_camera(random_scene(5)), width=4, height=3)
+    assert bool(torch.isfinite(scene.render(camera)).all()), "the image is not finite"
+
+
 def _exr(folder: Path) -> list[Files]:
     rng = np.random.default_rng(0)
     color = torch.from_numpy(rng.random((HEIGHT, WIDTH, 3), np.float32))
@@ -297,6 +315,7 @@ TARGETS = {
             lambda folder: camera_groups(folder, read_photos(folder, ["a.jpg"], 1, lambda _: None), "auto"),
             (".jpg",),
         ),
+        FuzzTarget("baked", _baked, _read_baked, (".nxb", ".glb")),
         FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
     )
 }

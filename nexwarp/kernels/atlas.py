@@ -1,0 +1,266 @@
+"""Baked scenes: surfels, or cards, whose texels lie in one atlas (`export.baked_scene`). Not in the paper.
+
+A thread is a pixel. Read: the surfels' records and limits, the tiles' lists, and the atlas. Written:
+
+    ids          of `nearest`: the first few hits by their own depth, for programs that test depths instead of sorting
+    image        sum over the hits of weight * colour, without background
+    alphas       1 - final transmittance
+    texels       backward: gradients of the atlas
+    colors       backward: gradients of the surfels' plain colours and, fourth, of their opacities
+
+A surfel has its own alpha (`shape`), and its colour is the plain one plus a texel. A card is the rectangle of |u| and
+|v| up to 1 with the colour and alpha of a texel. Of cut-outs, alpha becomes a coverage: 1 or 0 at a threshold, or in
+training a steep sigmoid. Hits are blended front to back, in the order of the list or of `nearest`. Geometry is frozen.
+The recurrence backward is that of `collect_backward`; it adds by atomics, so that on a CPU one thread walks all pixels.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from nexwarp.kernels.collect import alpha_if_near
+from nexwarp.kernels.surfel import hit
+from nexwarp.kernels.types import ALPHA_MAX, TileLists, types
+from nexwarp.kernels.walk import overflowed, pixel_of, surfel_at, tile_of, walk
+from nexwarp.native.vector_loads import load_record
+
+LARGEST_COVERAGE = 0.999  # in training: one of 1 would hide what is behind from its gradient
+FARTHEST = 1e30
+
+
+@functools.cache
+def atlas_types(real: type) -> SimpleNamespace:
+    """Make the structs of an atlas, of what is drawn of it, and of sums."""
+    t = types(real)
+
+    @wp.struct
+    class Atlas:
+        """Texels, and where those of each surfel lie."""
+
+        texels: wp.array2d(dtype=t.vec4)  # (height, width) RGBA
+        boxes: wp.array(dtype=t.vec4)  # (N) u0, v0, 1 / (u1 - u0), 1 / (v1 - v0), in units of the records' scales
+        rects: wp.array(
+            dtype=t.vec4
+        )  # (N) column and row of the first texel's centre, and from there to the last one's
+        cutoff: real  # alpha of half a coverage
+        steepness: real  # of the sigmoid; 0 is a threshold
+
+    @wp.struct
+    class Drawn:
+        """What is drawn, or its gradients; and the hits of cut-outs."""
+
+        image: wp.array(dtype=t.vec3)  # (pixels)
+        alphas: wp.array(dtype=real)
+        ids: wp.array2d(dtype=wp.int32)  # (pixels, layers), -1 behind the last
+
+    @wp.struct
+    class Sums:
+        """Gradients that all pixels add to."""
+
+        texels: wp.array2d(dtype=t.vec4)  # (height, width)
+        colors: wp.array(dtype=t.vec4)  # (N) of plain colours and opacity
+
+    return SimpleNamespace(Atlas=Atlas, Drawn=Drawn, Sums=Sums)
+
+
+@functools.cache
+def texel_functions(real: type) -> SimpleNamespace:
+    """Make the functions that find and sample a surfel's texels, bilinearly, and add to their gradients."""
+    t, Atlas = types(real), atlas_types(real).Atlas
+    vec2, vec4, ZERO, ONE = t.vec2, t.vec4, t.ZERO, t.ONE
+
+    @wp.func
+    def place_of(atlas: Atlas, i: wp.int32, u: real, v: real):
+        """(column, row), whole at centres of texels, of a point of surfel i."""
+        box = atlas.boxes[i]
+        rect = atlas.rects[i]
+        x = rect[0] + wp.clamp((u - box[0]) * box[2], ZERO, ONE) * rect[2]
+        y = rect[1] + wp.clamp((v - box[1]) * box[3], ZERO, ONE) * rect[3]
+        # As samplers clamp: rectangles of foreign files may end between the atlas' side and its outer texels.
+        last = wp.vec2i(atlas.texels.shape[1] - 1, atlas.texels.shape[0] - 1)
+        return vec2(wp.clamp(x, ZERO, real(float(last[0]))), wp.clamp(y, ZERO, real(float(last[1]))))
+
+    @wp.func
+    def corners(texels: wp.array2d(dtype=vec4), place: vec2):
+        """(left, top, right, bottom) of the texels around a place, and where it lies between them."""
+        x = int(wp.floor(place[0]))
+        y = int(wp.floor(place[1]))
+        ends = wp.vec4i(x, y, wp.min(x + 1, texels.shape[1] - 1), wp.min(y + 1, texels.shape[0] - 1))
+        return ends, vec2(place[0] - real(float(x)), place[1] - real(float(y)))
+
+    @wp.func
+    def sample(texels: wp.array2d(dtype=vec4), place: vec2):
+        e, f = corners(texels, place)
+        upper = texels[e[1], e[0]] * (ONE - f[0]) + texels[e[1], e[2]] * f[0]
+        lower = texels[e[3], e[0]] * (ONE - f[0]) + texels[e[3], e[2]] * f[0]
+        return upper * (ONE - f[1]) + lower * f[1]
+
+    @wp.func
+    def add(texels: wp.array2d(dtype=vec4), place: vec2, grad: vec4):
+        e, f = corners(texels, place)
+        wp.atomic_add(texels, e[1], e[0], grad * ((ONE - f[0]) * (ONE - f[1])))
+        wp.atomic_add(texels, e[1], e[2], grad * (f[0] * (ONE - f[1])))
+        wp.atomic_add(texels, e[3], e[0], grad * ((ONE - f[0]) * f[1]))
+        wp.atomic_add(texels, e[3], e[2], grad * (f[0] * f[1]))
+
+    return SimpleNamespace(place_of=place_of, sample=sample, add=add)
+
+
+@functools.cache
+def look_up_function(real: type, cards: bool, cut: bool) -> wp.Function:
+    """Make the function that returns what a ray meets of a surfel."""
+    t, Atlas, texel = types(real), atlas_types(real).Atlas, texel_functions(real)
+    vec2, vec3, ZERO, ONE, ALPHA_MIN = t.vec2, t.vec3, t.ZERO, t.ONE, t.ALPHA_MIN
+    place_of, sample = texel.place_of, texel.sample
+    CAP = wp.constant(real(LARGEST_COVERAGE if cut else ALPHA_MAX))
+
+    @wp.func
+    def covered(atlas: Atlas, alpha: real):
+        """(coverage of an alpha, its derivative)."""
+        coverage = alpha
+        slope = ONE
+        if wp.static(cut):
+            coverage = ONE / (ONE + wp.exp(atlas.steepness * (atlas.cutoff - alpha)))
+            slope = atlas.steepness * coverage * (ONE - coverage)
+            if atlas.steepness == ZERO:
+                return wp.where(alpha >= atlas.cutoff, ONE, ZERO), ZERO
+        return wp.min(coverage, CAP), wp.where(coverage < CAP, slope, ZERO)
+
+    @wp.func
+    def look_up(surfels: t.Surfels, atlas: Atlas, i: wp.int32, d: vec2, near: real):
+        """(colour of surfel i, not clamped; alpha, 0 for no hit; its slope by the parameter; depth; texels' place)."""
+        a, b, n, c = load_record(surfels.records, i)
+        u, v, depth = hit(a, b, n, c[3], d)
+        color = vec3()
+        alpha = wp.where(wp.abs(u) <= ONE and wp.abs(v) <= ONE, ONE, ZERO)
+        if wp.static(not cards):
+            alpha = alpha_if_near(u, v, surfels.limits[i], a[3], b[3], n[3])
+        slope = wp.where(alpha < CAP, alpha / a[3], ZERO)  # by the opacity
+        place = vec2()
+        if alpha < ALPHA_MIN or not (depth > near):
+            alpha = ZERO
+        else:
+            place = place_of(atlas, i, u, v)
+            texel = sample(atlas.texels, place)
+            color = vec3(texel[0], texel[1], texel[2])
+            if wp.static(cards):
+                alpha, slope = covered(atlas, texel[3])
+            else:
+                color += vec3(c[0], c[1], c[2])
+        return color, alpha, slope, depth, place
+
+    return look_up
+
+
+@functools.cache
+def nearest_kernel(real: type, layers: int) -> wp.Kernel:
+    """Make the kernel that finds each pixel's first `layers` cards that cover some of it, by depth."""
+    t, a = types(real), atlas_types(real)
+    Atlas, Drawn, look_up = a.Atlas, a.Drawn, look_up_function(real, True, True)
+    reals, integers = wp.types.vector(length=layers, dtype=real), wp.types.vector(length=layers, dtype=wp.int32)
+    FAR, ALPHA_MIN = wp.constant(real(FARTHEST)), t.ALPHA_MIN
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module="unique")
+    def nearest(first: wp.int32, surfels: t.Surfels, lists: TileLists, view: t.View, atlas: Atlas, drawn: Drawn):
+        thread = first + wp.tid()
+        xy, inside, d = pixel_of(thread, view)
+        if not inside:
+            return
+        ids = integers()
+        depths = reals()
+        for j in range(wp.static(layers)):
+            ids[j] = -1
+            depths[j] = FAR
+        overflow = overflowed(lists)
+        bounds = walk(tile_of(thread), lists, overflow)
+        for k in range(bounds[0], bounds[1]):
+            i = surfel_at(k, lists, overflow)
+            _color, alpha, _slope, depth, _place = look_up(surfels, atlas, i, d, view.near)
+            if alpha >= ALPHA_MIN and depth < depths[wp.static(layers - 1)]:
+                displaced = bool(False)
+                for j in range(wp.static(layers)):
+                    i_ = ids[j]
+                    depth_ = depths[j]
+                    displaced = displaced or depth < depth_
+                    ids[j] = wp.where(displaced, i, i_)
+                    depths[j] = wp.where(displaced, depth, depth_)
+                    i = wp.where(displaced, i_, i)
+                    depth = wp.where(displaced, depth_, depth)
+        for j in range(wp.static(layers)):
+            drawn.ids[xy[1] * view.size[0] + xy[0], j] = ids[j]
+
+    return nearest
+
+
+@functools.cache
+def surfel_function(real: type, cut: bool) -> wp.Function:
+    """Make the function that returns the surfel at place k of a pixel p's hits, -1 behind their end."""
+
+    @wp.func
+    def surfel_of(k: wp.int32, p: wp.int32, lists: TileLists, overflow: wp.bool, drawn: atlas_types(real).Drawn):
+        if wp.static(cut):
+            return drawn.ids[p, k]
+        return surfel_at(k, lists, overflow)
+
+    return surfel_of
+
+
+@functools.cache
+def blend_kernel(real: type, cards: bool, cut: bool, backward: bool) -> wp.Kernel:
+    """Make the kernel that blends the hits of the tile's list, or of `nearest`; or its derivative."""
+    t, a, texel = types(real), atlas_types(real), texel_functions(real)
+    vec3, vec4, ZERO, ONE, TRANSMITTANCE_MIN = t.vec3, t.vec4, t.ZERO, t.ONE, t.TRANSMITTANCE_MIN
+    look_up, add, surfel_of, Drawn = look_up_function(real, cards, cut), texel.add, surfel_function(real, cut), a.Drawn
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module="unique")
+    def blend(
+        first: wp.int32,
+        surfels: t.Surfels,
+        lists: TileLists,
+        view: t.View,
+        atlas: a.Atlas,
+        drawn: Drawn,
+        grads: Drawn,
+        sums: a.Sums,
+    ):
+        thread = first + wp.tid()
+        xy, inside, d = pixel_of(thread, view)
+        if not inside:
+            return
+        p = xy[1] * view.size[0] + xy[0]
+        overflow = overflowed(lists)
+        bounds = walk(tile_of(thread), lists, overflow)
+        if wp.static(cut):
+            bounds = wp.vec2i(0, drawn.ids.shape[1])
+        transmittance = real(1.0)
+        total = vec3()
+        grad = vec3()
+        rest = real(0.0)
+        if wp.static(backward):
+            grad = grads.image[p]
+            rest = wp.dot(grad, drawn.image[p]) + grads.alphas[p] * drawn.alphas[p]
+        for k in range(bounds[0], bounds[1]):
+            i = surfel_of(k, p, lists, overflow, drawn)
+            if i < 0 or transmittance < TRANSMITTANCE_MIN:
+                break
+            color, alpha, slope, _depth, place = look_up(surfels, atlas, i, d, view.near)
+            weight = alpha * transmittance
+            shown = wp.max(color, vec3())
+            total += shown * weight
+            if wp.static(backward) and alpha > ZERO:
+                q = wp.dot(grad, shown) + grads.alphas[p]
+                rest -= q * weight
+                row = vec4(ZERO, ZERO, ZERO, slope * (transmittance * q - rest / (ONE - alpha)))
+                for channel in range(3):
+                    row[channel] = wp.where(color[channel] > ZERO, grad[channel] * weight, ZERO)
+                if wp.static(not cards):
+                    wp.atomic_add(sums.colors, i, row)
+                    row[3] = ZERO
+                add(sums.texels, place, row)
+            transmittance = transmittance * (ONE - alpha)
+        if wp.static(not backward):
+            drawn.image[p] = total
+            drawn.alphas[p] = ONE - transmittance
+
+    return blend

@@ -1,0 +1,219 @@
+"""Baked files read back: the drawing against every surfel at every pixel in float64, and the files' round trips."""
+
+import dataclasses
+import re
+import struct
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp import ops
+from nexwarp.errors import FormatError, MissingError
+from nexwarp.export.bake import bake
+from nexwarp.export.baked_scene import BakedScene
+from nexwarp.export.glb import make_cards, save_glb
+from nexwarp.export.web.baked import BAKED_FILE
+from nexwarp.export.web.export import one_file, page_files
+from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
+from nexwarp.ops.atlas import Cut
+from tests.export.web import support
+from tests.export.web.support import as_stored, psnr, ring
+from tests.narrowing import present
+from tests.reference.collect import rotations
+from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.tolerances import assert_close
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
+
+@pytest.fixture(scope="module")
+def cameras() -> dict[str, nw.Camera]:
+    return ring()
+
+
+@pytest.fixture(scope="module")
+def model(cameras) -> nw.Model:
+    surfels = make_surfels(random_scene(12, width=64, height=48, seed=3))
+    gains = torch.linspace(-0.3, 0.3, len(cameras))[:, None].expand(-1, 3) * torch.tensor([1.0, 0.5, -0.5])
+    exposures = nw.Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
+    texture = make_texture(residual=True)
+    with torch.no_grad():
+        texture.grid.mul_(0.3)
+    return nw.Model(surfels, texture, exposures, options=nw.RenderOptions(background=(0.1, 0.2, 0.3)))
+
+
+@pytest.fixture(scope="module")
+def baked(model, cameras):
+    return bake(model, list(cameras.values()), steps=10)
+
+
+@pytest.fixture(scope="module")
+def files(model, cameras) -> dict[str, bytes]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nexwarp.export.bake.FEWEST_STEPS", 10)
+        patch.setattr("nexwarp.export.bake.MOST_STEPS", 10)
+        return page_files(model, cameras)
+
+
+def bilinear(texels: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Texels (height, width, 4) at columns and rows (...)."""
+    left, top = (z.detach().floor().long() for z in (x, y))
+    right, bottom = (left + 1).clamp(max=texels.shape[1] - 1), (top + 1).clamp(max=texels.shape[0] - 1)
+    fx, fy = ((z - w)[..., None] for z, w in ((x, left), (y, top)))
+    upper = texels[top, left] * (1 - fx) + texels[top, right] * fx
+    return upper * (1 - fy) + (texels[bottom, left] * (1 - fx) + texels[bottom, right] * fx) * fy
+
+
+def by_definition(scene: BakedScene, camera: nw.Camera) -> torch.Tensor:
+    """The image (H, W, 3) in float64, differentiable: every surfel at every pixel, without detail limits."""
+    shape, frames = scene.shape, rotations(scene.shape.quats.double())
+    viewmat, eye = camera.viewmat.detach().double(), camera.position.detach().double()
+    y, x = torch.meshgrid(torch.arange(camera.height).double(), torch.arange(camera.width).double(), indexing="ij")
+    rays = torch.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, torch.ones_like(x)], -1)
+    rays = rays.reshape(-1, 3) @ viewmat[:3, :3]
+    depths = ((shape.means - eye) * frames[:, :, 2]).sum(1) / (rays @ frames[:, :, 2].T)
+    offsets = eye + depths[..., None] * rays[:, None] - shape.means
+    local = torch.einsum("pni,nij->pnj", offsets, frames)[..., :2] / shape.scales
+    share = ((local - scene.boxes[:, :2]) / (scene.boxes[:, 2:] - scene.boxes[:, :2])).clamp(0, 1)
+    texels = bilinear(scene.texels, *(scene.rects[:, :2] + share * scene.rects[:, 2:]).unbind(-1))
+    if scene.harmonics is not None:
+        exponents = local.square().clamp_min(TINY).pow(shape.gammas).sum(-1)
+        alphas = (shape.opacities * torch.exp(-0.5 * exponents)).clamp(max=ALPHA_MAX)
+        alphas = alphas.where(alphas >= ALPHA_MIN, 0.0)
+        colors = (ops.plain_colors(scene.harmonics, shape.means, eye, 3) + texels[..., :3]).clamp_min(0)
+    else:
+        alphas, colors = texels[..., 3].clamp(max=ALPHA_MAX), texels[..., :3].clamp_min(0)
+        if scene.cut is not None and scene.cut.steepness:
+            alphas = torch.sigmoid(scene.cut.steepness * (texels[..., 3] - scene.cut.cutoff)).clamp(max=0.999)
+            alphas = alphas.where(alphas >= ALPHA_MIN, 0.0)
+        elif scene.cut is not None:
+            alphas = (texels[..., 3] >= scene.cut.cutoff).double()
+        alphas = alphas.where((local.abs() <= 1).all(-1), 0.0)
+    alphas = alphas.where(depths > camera.near, 0.0)
+    order = (shape.means @ viewmat[2, :3]).expand_as(depths) if scene.cut is None else depths
+    order = order.argsort(dim=1)
+    alphas = alphas.gather(1, order)
+    colors = colors.gather(1, order[..., None].expand(-1, -1, 3))
+    before = torch.cat([torch.ones_like(alphas[:, :1]), (1 - alphas).cumprod(1)], dim=1)
+    background = torch.tensor(scene.background, dtype=torch.float64)
+    image = ((alphas * before[:, :-1])[..., None] * colors).sum(1) + before[:, -1:] * background
+    return image.reshape(camera.height, camera.width, 3)
+
+
+def random_baked(form: str, count: int = 9) -> tuple[BakedScene, nw.Camera]:
+    """A scene in float64 with random texels of 5 x 4, and a camera."""
+    raw = random_scene(count, width=37, height=27, dtype=torch.float64)
+    surfels, camera = make_surfels(raw), make_camera(raw)
+    camera = dataclasses.replace(camera, viewmat=camera.viewmat.detach())
+    generator = torch.Generator().manual_seed(5)
+    texels = torch.rand(1 + 4 * count, 6, 4, generator=generator, dtype=torch.float64)
+    shape = type(surfels.activated())(*(x.detach() for x in surfels.activated()))
+    tops = 1 + 4.0 * torch.arange(count, dtype=torch.float64)
+    rects = torch.stack([torch.zeros_like(tops), tops, torch.full_like(tops, 4.0), torch.full_like(tops, 3.0)], dim=1)
+    boxes = torch.tensor([-1.0, -1, 1, 1], dtype=torch.float64).repeat(count, 1)
+    background = (0.2, 0.5, 0.1)
+    if form == "surfels":
+        boxes = boxes * torch.rand(count, 4, generator=generator, dtype=torch.float64).add(0.5)
+        harmonics = (surfels.sh0.detach().clone(), surfels.shN.detach().clone())
+        return BakedScene(shape, texels - 0.5, boxes, rects, harmonics, background=background), camera
+    shape = shape._replace(opacities=torch.ones_like(shape.opacities), gammas=torch.full_like(shape.gammas, 1000.0))
+    cut = {"blend": None, "mask": Cut(0.4), "soft": Cut(0.4, 7.0, layers=count)}[form]
+    return BakedScene(shape, texels, boxes, rects, background=background, cut=cut), camera
+
+
+@pytest.mark.parametrize("form", ["surfels", "blend", "mask", "soft"])
+def test_images_and_gradients_are_those_of_the_definition(form):
+    scene, camera = random_baked(form)
+    trained = [scene.texels, scene.shape.opacities, *(scene.harmonics or ())]
+    results = []
+    for draw in (lambda: scene.render(camera), lambda: by_definition(scene, camera)):
+        for x in trained:
+            x.requires_grad_().grad = None
+        image = draw()
+        factors = torch.rand(image.shape, generator=torch.Generator().manual_seed(1), dtype=image.dtype)
+        if form != "mask":
+            (image * factors).sum().backward()
+        results.append((image.detach(), *(x.grad for x in trained if x.grad is not None)))
+    drawn, expected = results
+    assert expected[0].std() > 0.05
+    assert_close(drawn[0], expected[0], kind="value", name="image")
+    # Of the definition, opacities of cards have no gradient; the drawing's are zero.
+    for name, actual, wanted in zip(("texels", "opacities", "sh0", "shN"), drawn[1:], expected[1:], strict=False):
+        assert_close(actual, wanted, kind="gradient", name=name)
+    assert form == "mask" or len(expected) == (5 if form == "surfels" else 2)
+
+
+def test_a_page_is_read_as_it_is_drawn(files, model, baked, cameras, tmp_path):
+    (tmp_path / "page").mkdir()
+    for name, data in files.items():
+        if "/" not in name:
+            (tmp_path / "page" / name).write_bytes(data)
+    (tmp_path / "one.html").write_bytes(one_file(files))
+    places = [
+        tmp_path / "one.html",
+        tmp_path / "page",
+        tmp_path / "page" / "index.html",
+        tmp_path / "page" / BAKED_FILE,
+    ]
+    scenes = [nw.load_baked(place) for place in places]
+    for camera in cameras.values():
+        images = [scene.render(camera) for scene in scenes]
+        assert all(torch.equal(image, images[0]) for image in images)
+        stored = as_stored(dataclasses.replace(baked, model=model))
+        expected = support.composited(stored, camera) * model.exposures.factors(camera)
+        assert psnr(images[0], expected) > 75
+
+
+@pytest.mark.parametrize("alpha", ["mask", "blend"])
+def test_cards_are_read_as_they_were_written(alpha, baked, cameras, tmp_path):
+    pytest.importorskip("trimesh")
+    cards = make_cards(baked, alpha)
+    save_glb(tmp_path / "a.glb", cards, list(cameras.values()))
+    read = nw.load_baked(tmp_path / "a.glb")
+    assert read.cut == cards.cut and (read.cut is None) == (alpha == "blend")
+    assert_close(read.shape.means, cards.shape.means, kind="gradient", name="means")
+    assert_close(read.shape.scales, cards.shape.scales, kind="gradient", name="scales")
+    assert float((read.texels - cards.texels).abs().max()) < 0.51 / 255
+    assert float((read.rects - cards.rects).abs().max()) < 1e-3
+    for camera in cameras.values():
+        # Pixels on the edge of a cut-out may flip where its alpha is rounded.
+        assert psnr(read.render(camera), cards.render(camera)) > (30 if alpha == "mask" else 45)
+        double = dataclasses.replace(read, **{x: getattr(read, x).double() for x in ("texels", "rects", "boxes")})
+        double = dataclasses.replace(double, shape=type(read.shape)(*(x.double() for x in read.shape)))
+        assert psnr(read.render(camera), by_definition(double, camera)) > (30 if alpha == "mask" else 60)
+
+
+def test_damaged_files_give_one_line(files, baked, cameras, tmp_path):
+    pytest.importorskip("trimesh")
+    save_glb(tmp_path / "good.glb", make_cards(baked), list(cameras.values()))
+    page, glb = one_file(files), (tmp_path / "good.glb").read_bytes()
+    with pytest.raises(MissingError, match="expected a page or a"):
+        nw.load_baked(tmp_path / "none.glb")
+    length = struct.unpack_from("<I", glb, 12)[0]
+    cases = [(page[: len(page) // 2], ".html"), (b"", ".html"), (b"", ".glb"), (glb[: 28 + length], ".glb")]
+    cases += [(b"GIF8" + glb[4:], ".glb"), (glb.replace(b'"VEC3"', b'"VEC9"'), ".glb")]
+    cases += [(glb.replace(b'"MASK"', b'"MARK"'), ".glb"), (glb.replace(b'"byteLength"', b'"byteLengte"'), ".glb")]
+    name = f'id="asset:{BAKED_FILE}">'.encode()
+    cases.append((page.replace(name, name + b"AAAA"), ".html"))
+    for content, suffix in cases:
+        file = tmp_path / f"bad{suffix}"
+        file.write_bytes(content)
+        with pytest.raises((FormatError, MissingError)) as error:
+            nw.load_baked(file)
+        assert re.fullmatch(r".*bad.*expected.*", str(error.value)), "one line that names the file"
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("form", ["surfels", "blend", "mask", "soft"])
+def test_a_gpu_draws_what_the_cpu_draws(form):
+    scene, camera = random_baked(form)
+    there = scene.to("cuda")
+    images = []
+    for each in (scene, there):
+        texels = each.texels.requires_grad_()
+        image = each.render(camera)
+        image.square().sum().backward()
+        images.append((image.detach().cpu(), present(texels.grad).cpu()))
+    assert_close(images[1][0], images[0][0], kind="value", name="image")
+    assert_close(images[1][1], images[0][1], kind="gradient", name="texels")
