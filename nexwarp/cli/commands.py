@@ -19,7 +19,7 @@ from nexwarp.cli.options import Device_, Flag_, Host_, Port_, Preset_, Run_, che
 from nexwarp.data import View
 from nexwarp.data.scene import DEMO, SceneSource, scene_kinds
 from nexwarp.data.sfm import SfmOptions, process
-from nexwarp.data.sfm.photos import CONVERTIBLE, FILMS, SUFFIXES
+from nexwarp.data.sfm.photos import FILMS, OTHERS, SUFFIXES
 from nexwarp.data.sfm.process import FRAMES, REPORT_FILE, source_identity
 from nexwarp.errors import MissingError, RunError, SceneError
 from nexwarp.io.json_files import READ_ERRORS, Json, read_object, write_json
@@ -55,7 +55,7 @@ class Process:
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO|PHOTOS")]
-    """A video (extra `video`), or a folder of photos (JPEG, PNG, TIFF, BMP) with its subfolders."""
+    """A video (extra `video`), or a folder of photos (JPEG, PNG, TIFF, BMP, WebP, AVIF, HEIC) with its subfolders."""
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Output folder: images/ (undistorted), sparse/0/ (a COLMAP model) and the report sfm.json."""
     frames: Annotated[int, option("N")] = FRAMES
@@ -89,7 +89,7 @@ def needs_cameras(source: SceneSource) -> bool:
         return path.suffix.lower() in FILMS
     if source.path == DEMO or source.format or source.images != SceneSource.images or scene_kinds(path):
         return False
-    return any(file.suffix.lower() in (*SUFFIXES, *CONVERTIBLE) for file in path.iterdir())
+    return any(file.suffix.lower() in (*SUFFIXES, *OTHERS) for file in path.iterdir())
 
 
 def scene_folder_of(source: Path) -> Path:

@@ -2,9 +2,10 @@
 
 import io
 import os
+import struct
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     import PIL.Image
 
 # PIL supports other formats; some of them start other programs.
-FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "PPM", "GIF", "TGA", "JPEG2000", "AVIF")
+FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "PPM", "GIF", "TGA", "JPEG2000", "AVIF", "HEIF")
 ROWS = 256  # rows that are converted at a time
 MAX_SUM = 2**32 - 1
 MAX_PIXELS = 178_956_970  # PIL's own error limit, twice its limit for a warning
@@ -28,6 +29,22 @@ MAX_READS = 1_000_000  # a second; a GIF file of 100 MB has as many
 WHITE = 128  # threshold of a mask; if no value reaches it, as in a mask of 0 and 1, all values above 0 are used
 WIDTH, HEIGHT, BITS, PHOTOMETRIC, ORIENTATION, SAMPLE_FORMAT = 256, 257, 258, 262, 274, 339  # TIFF tags
 WHITE_IS_ZERO, UNSIGNED = 0, 1
+MAKE, MODEL, EXIF_IFD = 271, 272, 0x8769  # EXIF tags
+EXIF_ERRORS = (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.error)  # of PIL, for damaged EXIF
+COPY_QUALITY = 97  # of upright copies of JPEG files
+
+
+def decodable_formats() -> list[str]:
+    """PIL's names of the formats that are read; HEIF is one of them if the package pillow-heif is installed."""
+    from PIL import Image
+
+    Image.init()  # so that it knows the formats that this build can decode
+    if "HEIF" not in Image.OPEN:
+        with suppress(ImportError):
+            import pillow_heif
+
+            pillow_heif.register_heif_opener()
+    return [name for name in FORMATS if name in Image.OPEN]
 
 
 @contextmanager
@@ -66,9 +83,7 @@ def _opened(path: Path) -> Iterator["PIL.Image.Image"]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: image not found, but the COLMAP model names it")
     try:
-        Image.init()  # so that it knows the formats that this build can decode
-        formats = [name for name in FORMATS if name in Image.OPEN]
-        with _Bounded(path) as file, Image.open(file, formats=formats) as image:
+        with _Bounded(path) as file, Image.open(file, formats=decodable_formats()) as image:
             # PIL's own check can be disabled by other libraries.
             pixels = image.width * image.height
             if pixels > MAX_PIXELS:
@@ -108,26 +123,46 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size if tags is None else (int(tags[WIDTH]), int(tags[HEIGHT]))
 
 
+def _orientation(image: "PIL.Image.Image") -> int:
+    """Return the EXIF orientation, 1 to 8, of an image that is not decoded yet; 1 (upright) without a valid one."""
+    if image.format == "PNG" and not image.info.keys() & {"exif", "Raw profile type exif", "xmp"}:
+        return 1  # PIL would decode the whole file to look for EXIF behind the pixels
+    try:
+        value = image.getexif().get(ORIENTATION)
+    except EXIF_ERRORS:
+        return 1
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def is_turned(path: Path) -> bool:
+    """Whether the EXIF orientation of an image says that its pixels are not upright; errors as of `read_image`."""
+    with quiet_pillow(), _opened(path) as image:
+        return _orientation(image) != 1
+
+
 @contextmanager
-def _loaded(path: Path) -> Iterator["PIL.Image.Image"]:
-    """Open an image and decode its pixels as stored: PIL turns TIFF files by their orientation, which is undone."""
+def _loaded(path: Path, upright: bool = False) -> Iterator["PIL.Image.Image"]:
+    """Open an image and decode its pixels, as stored or upright. PIL turns TIFF files, and no others, upright."""
     from PIL.Image import Transpose
 
     with _opened(path) as image:
-        orientation = image.getexif().get(ORIENTATION) if hasattr(image, "tag_v2") else None
+        orientation, is_upright = _orientation(image), hasattr(image, "tag_v2")
         image.load()
-        undo = {
+        to_upright = {
             2: Transpose.FLIP_LEFT_RIGHT,
             3: Transpose.ROTATE_180,
             4: Transpose.FLIP_TOP_BOTTOM,
             5: Transpose.TRANSPOSE,
-            6: Transpose.ROTATE_90,
+            6: Transpose.ROTATE_270,
             7: Transpose.TRANSVERSE,
-            8: Transpose.ROTATE_270,
-        }.get(orientation or 0)
-        stored = image if undo is None else image.transpose(undo)
+            8: Transpose.ROTATE_90,
+        }
+        if not upright:  # the inverse; only a quarter turn is not its own
+            orientation = {6: 8, 8: 6}.get(orientation, orientation)
+        turn = None if is_upright == upright else to_upright.get(orientation)
+        turned = image if turn is None else image.transpose(turn)
         tags = getattr(image, "tag_v2", {})
-        yield _full_range(stored, tags.get(BITS, (16,))[0], tags.get(PHOTOMETRIC) == WHITE_IS_ZERO)
+        yield _full_range(turned, tags.get(BITS, (16,))[0], tags.get(PHOTOMETRIC) == WHITE_IS_ZERO)
 
 
 def _full_range(image: "PIL.Image.Image", bits: int, inverted: bool) -> "PIL.Image.Image":
@@ -150,6 +185,30 @@ def read_image(path: Path) -> torch.Tensor:
     """
     with _loaded(path) as image:
         return torch.from_numpy(_to_rgb(image))
+
+
+def copy_upright(path: Path, target: Path) -> torch.Tensor:
+    """Write an upright copy of a photo, in the format of the target's suffix, and return its (H, W, 3) uint8 pixels.
+
+    The copy keeps of EXIF the camera and how it was set (focal length). Errors are those of `read_image`; OSError:
+    `target` cannot be written.
+    """
+    from PIL import Image
+
+    with _loaded(path, upright=True) as image:
+        pixels = _to_rgb(image)
+    kept = Image.Exif()
+    with _opened(path) as image, suppress(*EXIF_ERRORS):
+        exif = image.getexif()
+        kept.get_ifd(EXIF_IFD).update(exif.get_ifd(EXIF_IFD))
+        kept.update({tag: exif[tag] for tag in (MAKE, MODEL) if tag in exif})
+    target.parent.mkdir(parents=True, exist_ok=True)
+    copy = Image.fromarray(pixels)
+    try:
+        copy.save(target, quality=COPY_QUALITY, subsampling=0, exif=kept.tobytes())
+    except (ValueError, TypeError, struct.error):  # EXIF that PIL cannot write, as above 64 KB
+        copy.save(target, quality=COPY_QUALITY, subsampling=0)
+    return torch.from_numpy(pixels)
 
 
 def read_transparent(path: Path) -> tuple[torch.Tensor, torch.Tensor | None]:

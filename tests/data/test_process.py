@@ -110,7 +110,7 @@ def test_photos_that_are_blurred_or_repeated_are_named_and_kept(tmp_path: Path) 
         window = picture[20:140, 10 * min(index, 4) : 10 * min(index, 4) + 160]
         window = gaussian_filter(window, 5.0) if index == 2 else window
         Image.fromarray(window.astype(np.uint8)).convert("RGB").save(tmp_path / name)
-    assert judged(read_photos(tmp_path, names, 1, lambda done: None)) == (["2.png"], ["5.png"])
+    assert judged(read_photos(tmp_path, names, 1, lambda done: None)[0]) == (["2.png"], ["5.png"])
 
 
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])

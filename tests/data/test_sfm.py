@@ -13,16 +13,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 from scipy.ndimage import map_coordinates
 
 from nexwarp.cli import main as cli
 from nexwarp.data import load_scene
 from nexwarp.data.capture import Capture
 from nexwarp.data.colmap import read_model
+from nexwarp.data.images import copy_upright, decodable_formats, is_turned
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.sfm import SfmOptions, reconstruct
-from nexwarp.data.sfm.photos import affordable_threads, list_photos
+from nexwarp.data.sfm.photos import InputPhoto, affordable_threads, camera_groups, list_photos
 from nexwarp.data.sfm.report import Overlaps, advise, components, left_out
 from nexwarp.data.sfm.stages import exhaustive_pairs, sequential_pairs
 from nexwarp.errors import OutOfMemoryError, SceneError, StorageError
@@ -38,6 +39,7 @@ PHOTOS = Path(__file__).parent / "photos"
 TARGET = np.array([0.0, 0.0, 0.62])
 DISTANCE = 3.15  # of the cameras from what they look at
 K1 = -0.12
+SPARSE = ("cameras.bin", "images.bin", "points3D.bin")
 PINHOLE = SfmOptions(camera_model="simple_pinhole")
 
 
@@ -124,7 +126,7 @@ def assert_cameras_agree(model: Capture, truth: dict[str, np.ndarray], within: f
 
 
 def test_cameras_come_back(made, photos, arc):
-    assert list_photos(photos) == list(arc.images), "in the order in which people number them"
+    assert list_photos(photos) == (list(arc.images), {}), "in the order in which people number them"
     model = read_model(made, made / "images")
     assert [photo.name for photo in model.photos] == sorted(arc.images)
     assert_cameras_agree(model, arc.viewmats, within=0.01)
@@ -230,6 +232,94 @@ def test_folders_exif_and_a_stray_photo(arc, tmp_path, capsys):
     assert len({photo.lens.params[0] for photo in model.photos}) == 2
 
 
+# Photos of phones
+
+TURNED = {6: 1, 8: -1, 3: 2}  # EXIF orientation: quarter turns to the left from upright to stored pixels
+
+
+def stored(path: Path) -> tuple[np.ndarray, dict[int, Any]]:
+    """Pixels of a file and its EXIF tags."""
+    with Image.open(path) as image:
+        exif = image.getexif()
+        return np.asarray(image.convert("RGB")), {**exif, **exif.get_ifd(0x8769)}
+
+
+def save_turned(path: Path, image: np.ndarray, orientation: int, **options: Any) -> None:
+    exif = Image.Exif()
+    exif[274] = orientation
+    Image.fromarray(np.rot90(image, TURNED[orientation])).save(path, exif=exif, **options)
+
+
+def test_photos_turned_by_exif_give_the_cameras_of_upright_ones(made, arc, tmp_path):
+    """Two of the photos are stored on their side, one upside down: scene and photos are those of upright files."""
+    folder = write_photos(tmp_path / "photos", arc.images)
+    for name, orientation in zip(("view 6.png", "view 8.png", "view 10.png"), TURNED, strict=True):
+        save_turned(folder / name, arc.images[name], orientation)
+    assert stored(folder / "view 6.png")[0].shape == (WIDTH, HEIGHT, 3)
+    reconstruct(folder, tmp_path / "scene", dataclasses.replace(PINHOLE, threads=1))
+    scene = tmp_path / "scene"
+    assert not any(file.is_symlink() for file in scene.rglob("*"))
+    assert {(scene / "sparse/0" / n).read_bytes() == (made / "sparse/0" / n).read_bytes() for n in SPARSE} == {True}
+    for name, image in arc.images.items():
+        pixels, exif = stored(scene / "images" / name)
+        assert exif.get(274, 1) == 1 and np.array_equal(pixels, image)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_upright_copies_are_those_of_pillow(suffix, orientation, tmp_path):
+    exif = Image.Exif()
+    exif[274], exif[271] = orientation, "Maker"
+    exif.get_ifd(0x8769)[41989] = 37
+    file, copy = tmp_path / f"a.{suffix}", tmp_path / ("copy.jpg" if suffix == "webp" else f"copy.{suffix}")
+    smooth = np.stack(np.meshgrid(np.arange(0, 160, 4), np.arange(0, 96, 4), [90]), axis=-1)[:, :, 0].astype(np.uint8)
+    Image.fromarray(smooth).save(file, exif=exif.tobytes(), quality=95)
+    assert is_turned(file) == (orientation != 1)
+    pixels = copy_upright(file, copy).numpy()
+    with Image.open(file) as image:
+        assert np.array_equal(pixels, np.asarray(ImageOps.exif_transpose(image).convert("RGB")))
+    written, kept = stored(copy)
+    assert np.abs(pixels.astype(int) - written).max() <= (4 if "jpg" in copy.name else 0)
+    assert (kept.get(274, 1), kept[271], kept[41989]) == (1, "Maker", 37)
+
+
+def test_a_folder_of_a_phone(arc, tmp_path, capsys):
+    """WebP and AVIF are read; a damaged photo and a raw one are named and left out, unless --strict stops there."""
+    folder = write_photos(tmp_path / "photos", arc.images)
+    for name, suffix in (("view 5", "webp"), ("view 7", "avif" if "AVIF" in decodable_formats() else "webp")):
+        (folder / f"{name}.png").unlink()
+        Image.fromarray(arc.images[f"{name}.png"]).save(folder / f"{name}.{suffix}", quality=95)
+    (folder / "View 8.HEIC").write_bytes(b"the same photo again")
+    damaged = folder / "view 9.png"
+    damaged.write_bytes(damaged.read_bytes()[:9000])
+    command = ["sfm", str(folder), str(tmp_path / "scene"), "--camera-model", "simple_pinhole", "--cameras", "single"]
+    refused(capsys, [*command, "--strict"], "view 9.png: expected a complete image file")
+    for name in ("a.dng", "b.dng"):
+        (folder / name).write_bytes(b"raw")
+    refused(capsys, [*command, "--strict"], "a.dng: .dng: convert to JPEG or PNG first")
+    assert cli.main(command) == 0
+    out = capsys.readouterr().out
+    assert "skipped 2: 'a.dng', 'b.dng': .dng: convert to JPEG or PNG first\n" in out
+    assert "skipped 1: 'view 9.png': expected a complete image file" in out and "6 of 7 photos" in out
+    report = json.loads((tmp_path / "scene" / "sfm.json").read_text())
+    assert set(report["skipped"]) == {"a.dng", "b.dng", "View 8.HEIC", "view 9.png"}
+    truth = {
+        Path(n).stem + (".jpg" if n in ("view 5.png", "view 7.png") else ".png"): arc.viewmats[n] for n in arc.images
+    }
+    model = read_model(tmp_path / "scene", tmp_path / "scene" / "images")
+    assert {photo.name for photo in model.photos} == truth.keys() - {"view 9.png"}
+    assert_cameras_agree(model, truth, within=0.02)
+
+
+@pytest.mark.parametrize(("cameras", "count"), [("single", 2), ("folder", 3)])
+def test_portrait_and_landscape_photos_have_a_camera_each(cameras, count):
+    shapes = {"a/1.jpg": (40, 30), "a/2.jpg": (30, 40), "b/3.jpg": (40, 30), "a/4.jpg": (30, 40)}
+    thumbnail = np.zeros((3, 4), np.uint8)
+    photos = [InputPhoto(name, size, ("", ""), None, 1.0, thumbnail) for name, size in shapes.items()]
+    groups = camera_groups(Path("photos"), photos, cameras)
+    assert len(groups) == count and ["a/2.jpg", "a/4.jpg"] in [[photo.name for photo in group] for group in groups]
+
+
 # What is compared
 
 
@@ -312,7 +402,7 @@ BAD_PHOTOS = {
     "no folder": (lambda folder, arc: None, [], "no such folder, expected one with photos"),
     "no photos": (with_files(notes_txt=b"none", __hidden_png=b"x"), [], "3 photos (.jpg, .jpeg, .png, .tif, .tiff"),
     "other formats": (with_files(a_heic=b"", b_HEIC=b"", c_mp4=b""), [], "none; 2 .heic: convert to JPEG or PNG first"),
-    "a truncated photo": (spoilt, [], "view 7.png: expected a complete image file"),
+    "a truncated photo": (spoilt, ["--strict"], "view 7.png: expected a complete image file"),
     "no image at all": (with_files(a_jpg=b"<html>", b_jpg=b"", c_jpg=b"x"), [], "a.jpg: expected a complete image"),
     "photos of nothing in common": (with_files(**STRANGERS), [], "0 of 4 photos registered, expected at least 3; 0 of"),
     "grey walls": (with_files(**WALLS), [], "3 of 3 photos have fewer than 500 features"),

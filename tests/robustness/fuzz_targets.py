@@ -20,10 +20,10 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.data import load_scene
-from nexwarp.data.images import read_image, read_mask, read_transparent
+from nexwarp.data.images import MAKE, MODEL, read_image, read_mask, read_transparent
 from nexwarp.data.ply import read_ply
 from nexwarp.data.scene import SceneSource
-from nexwarp.data.sfm.photos import MAKE, MODEL, camera_groups, read_photos
+from nexwarp.data.sfm.photos import camera_groups, read_photos
 from nexwarp.export.bake import bake
 from nexwarp.export.baked_scene import load_baked
 from nexwarp.export.glb import make_cards, save_glb
@@ -312,7 +312,7 @@ TARGETS = {
         FuzzTarget(
             "photos",
             _photo_files,
-            lambda folder: camera_groups(folder, read_photos(folder, ["a.jpg"], 1, lambda _: None), "auto"),
+            lambda folder: camera_groups(folder, read_photos(folder, ["a.jpg"], 1, lambda _: None)[0], "auto"),
             (".jpg",),
         ),
         FuzzTarget("baked", _baked, _read_baked, (".nxb", ".glb")),

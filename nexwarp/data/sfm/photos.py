@@ -3,19 +3,30 @@
 import math
 import os
 import re
-import struct
+import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from statistics import median
+from typing import TypeVar
 
 import numpy as np
 
 from nexwarp.data.capture import safe_name, short
-from nexwarp.data.images import downscale_image, image_size, read_image
+from nexwarp.data.images import (
+    EXIF_ERRORS,
+    MAKE,
+    MODEL,
+    copy_upright,
+    decodable_formats,
+    downscale_image,
+    image_size,
+    is_turned,
+    read_image,
+)
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.scene import GIB, SHARE
 from nexwarp.data.sfm.frames import BLURRED, SIDE, STILL, THUMBNAIL, motion, reduced_luma, sharpness
@@ -24,41 +35,57 @@ from nexwarp.errors import OutOfMemoryError
 from nexwarp.machine import available_memory
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")  # formats that both PIL and pycolmap 4.2 decode
-CONVERTIBLE = (".heic", ".heif", ".webp", ".avif", ".gif", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
+CONVERTED = {".heic": "HEIF", ".heif": "HEIF", ".avif": "AVIF", ".webp": "WEBP"}  # to JPEG, where PIL decodes them
+OTHERS = (*CONVERTED, ".gif", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
+SECOND = "another file of that name is used"
 MIN_PHOTOS = 3
 MANY = 5  # photos of one camera that determine the eight parameters of OPENCV
-MAKE, MODEL = 271, 272  # EXIF tags
 PIXEL_BYTES = 12  # of memory, to decode or undistort a photo, a pixel
 FEATURE_BYTES = 240  # of memory, to find SIFT features, a pixel of the reduced photo
 MOST_DECODED = 2 * GIB  # memory of the photos that are decoded at once, if there are several
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class InputPhoto:
     """A photo before reconstruction, without a pose."""
 
-    name: str  # path below the photos' folder, with "/" as separator
-    size: tuple[int, int]  # width and height in pixels; EXIF orientation is not applied
+    name: str  # in the scene: path below the photos' folder, with "/" as separator; .jpg if it was converted
+    size: tuple[int, int]  # width and height in pixels, upright
     device: tuple[str, str]  # make and model of the camera from EXIF, empty if absent
     focal: float | None  # in pixels from EXIF; None if absent
     sharpness: float  # as of `frames.sharpness`
     thumbnail: np.ndarray  # (h, w) uint8 brightness, reduced to 160 pixels
 
 
-def list_photos(folder: Path) -> list[str]:
+def list_photos(folder: Path) -> tuple[list[str], dict[str, str]]:
     """Names of the photos below `folder`, without hidden files, in numeric order (IMG_9 before IMG_10).
 
-    ValueError: it has fewer than 3 photos, or one that is a link out of it or has a name that no scene can have.
+    The second value names those in other formats that are not used, with the reason. ValueError: the folder has fewer
+    than 3 photos, or one that is a link out of it or has a name that no scene can have.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder, expected one with photos")
     files = [f.relative_to(folder) for f in folder.rglob("*") if f.is_file()]
     files = [f for f in files if not any(part.startswith(".") for part in f.parts)]
-    names = sorted((f.as_posix() for f in files if f.suffix.lower() in SUFFIXES), key=_natural)
+    names, skipped = [f.as_posix() for f in files if f.suffix.lower() in SUFFIXES], {}
+    taken, formats = {_stem(name) for name in names}, decodable_formats()
+    for file in sorted(f.as_posix() for f in files if f.suffix.lower() in OTHERS):
+        kind = Path(file).suffix.lower()
+        if _stem(file) in taken:  # phones write one photo in two formats
+            skipped[file] = SECOND
+        elif CONVERTED.get(kind) in formats:
+            taken.add(_stem(file))
+            names.append(file)
+        else:
+            package = ", or pip install pillow-heif" if CONVERTED.get(kind) == "HEIF" else ""
+            skipped[file] = f"{kind}: convert to JPEG or PNG first{package}"
+    names = sorted(names, key=_natural)
     if len(names) < MIN_PHOTOS:
         kinds = Counter(f.suffix.lower() for f in files)
-        others = [f"{kinds[s]} {s}: convert to JPEG or PNG first" for s in CONVERTIBLE if kinds[s]]
+        others = [f"{count} {reason}" for reason, count in Counter(skipped.values()).items()]
         others += [f"{kinds[s]} {s}: give the film itself to nexwarp process" for s in FILMS if kinds[s]]
         there = "; ".join([f"{len(names) or 'none'}", *others])
         raise ValueError(f"{folder}: expected at least {MIN_PHOTOS} photos ({', '.join(SUFFIXES)}), found {there}")
@@ -66,7 +93,12 @@ def list_photos(folder: Path) -> list[str]:
         safe_name(f"{folder}: photo", name, "folder of the photos")
         if not (folder / name).resolve().is_relative_to(folder.resolve()):
             raise ValueError(f"{folder}: photo {short(name)}: a link leaves the folder; put the photo itself there")
-    return names
+    return names, skipped
+
+
+def _stem(name: str) -> str:
+    """What two files of one photo have in common."""
+    return str(PurePosixPath(name).with_suffix("")).casefold()
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -93,27 +125,80 @@ def affordable_threads(folder: Path, names: Sequence[str], options: SfmOptions) 
     return max(1, min(most, int(SHARE * free) // each, max(MOST_DECODED // (PIXEL_BYTES * pixels), 1)))
 
 
-def read_photos(folder: Path, names: Sequence[str], threads: int, done: Callable[[int], None]) -> list[InputPhoto]:
-    """Decode every photo, so that a damaged one is reported before the reconstruction, and read its EXIF.
+def read_each(
+    folder: Path, names: Sequence[str], read: Callable[[str], T], strict: bool
+) -> tuple[dict[str, T], dict[str, str]]:
+    """Return what `read` gives for each photo, and the reasons of those for which it raises ValueError.
 
-    `threads` photos are decoded at once; `done` is called with the number of photos that were read.
+    ValueError: fewer than 3 photos are left, or, if `strict`, one cannot be read.
     """
-    photos: list[InputPhoto] = []
-    with ThreadPoolExecutor(threads) as pool:  # decoding releases the GIL
-        jobs = [pool.submit(_read_photo, folder, name) for name in names]
+    results: dict[str, T] = {}
+    skipped: dict[str, str] = {}
+    for name in names:
         try:
-            for count, job in enumerate(jobs, start=1):
-                photos.append(job.result())
-                done(count)
+            results[name] = read(name)
+        except ValueError as error:
+            if strict or isinstance(error.__cause__, MemoryError):
+                raise
+            skipped[name] = str(error).removeprefix(f"{folder / name}: ")
+    if skipped and len(results) < MIN_PHOTOS:
+        name, reason = next(iter(skipped.items()))
+        raise ValueError(
+            f"{folder}: expected at least {MIN_PHOTOS} photos that can be read, found {len(results) or 'none'} of "
+            f"{len(names)}; {name}: {reason}"
+        )
+    return results, skipped
+
+
+def is_copied(file: Path) -> bool:
+    """Whether pycolmap needs a copy of a photo: upright, or as JPEG; errors are those of `read_image`."""
+    return is_turned(file) or file.suffix.lower() in CONVERTED
+
+
+def read_photos(
+    folder: Path,
+    names: Sequence[str],
+    threads: int,
+    done: Callable[[int], None],
+    prepared: Path | None = None,
+    strict: bool = True,
+) -> tuple[list[InputPhoto], dict[str, str]]:
+    """Decode every photo, and read its EXIF; errors and the second value are those of `read_each`.
+
+    `threads` photos are decoded at once; `done` is called with the number of photos that were read. With `prepared`,
+    that folder gets what pycolmap is to read: links to the photos, and copies of those that `is_copied` tells.
+    """
+    with ThreadPoolExecutor(threads) as pool:  # decoding releases the GIL
+        jobs = {name: pool.submit(_read_photo, folder, name, prepared) for name in names}
+        count = 0
+
+        def result(name: str) -> InputPhoto:
+            nonlocal count
+            count += 1
+            photo = jobs[name].result()
+            done(count)
+            return photo
+
+        try:
+            photos, skipped = read_each(folder, names, result, strict)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    return photos
+    return list(photos.values()), skipped
 
 
-def _read_photo(folder: Path, name: str) -> InputPhoto:
+def _read_photo(folder: Path, name: str, prepared: Path | None) -> InputPhoto:
     path = folder / name
-    pixels = read_image(path)
+    if prepared is not None and is_copied(path):
+        original = path
+        if path.suffix.lower() in CONVERTED:
+            name = PurePosixPath(name).with_suffix(".jpg").as_posix()
+        path = prepared / name
+        pixels = copy_upright(original, path)
+    else:
+        pixels = read_image(path)
+        if prepared is not None:
+            _link(path, prepared / name)
     height, width = pixels.shape[:2]
     luma = downscale_image(pixels, max(max(height, width) // SIDE, 1)).float().mean(-1).byte().numpy()
     del pixels  # before pycolmap reads it
@@ -126,6 +211,14 @@ def _read_photo(folder: Path, name: str) -> InputPhoto:
     focal = camera.focal_length if camera.has_prior_focal_length else None
     score, thumbnail = sharpness(reduced_luma(luma)), reduced_luma(luma, THUMBNAIL)
     return InputPhoto(name, (width, height), _device(path), focal, score, thumbnail)
+
+
+def _link(file: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        target.symlink_to(file.absolute())
+    except OSError:  # Windows allows it to administrators only
+        shutil.copyfile(file, target)
 
 
 def judged(photos: Sequence[InputPhoto]) -> tuple[list[str], list[str]]:
@@ -146,16 +239,19 @@ def _device(path: Path) -> tuple[str, str]:
         with Image.open(path) as image:
             exif = image.getexif()
             return str(exif.get(MAKE, "")), str(exif.get(MODEL, ""))
-    except (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.error):  # damaged EXIF counts as absent
+    except EXIF_ERRORS:  # damaged EXIF counts as absent
         return "", ""
 
 
 def camera_groups(folder: Path, photos: Sequence[InputPhoto], cameras: str) -> list[list[InputPhoto]]:
-    """Group photos that share a camera by `SfmOptions.cameras`; ValueError where photos of one differ in size."""
+    """Group photos that share a camera by `SfmOptions.cameras`; ValueError where photos of one differ in size.
+
+    Portrait and landscape photos have a camera each.
+    """
     keys: dict[str, Callable[[InputPhoto], object]] = {
         "auto": lambda p: (p.size, p.device, p.focal and round(p.focal)),
-        "single": lambda p: (),
-        "folder": lambda p: p.name.rpartition("/")[0],
+        "single": lambda p: p.size[0] < p.size[1],
+        "folder": lambda p: (p.name.rpartition("/")[0], p.size[0] < p.size[1]),
         "image": lambda p: p.name,
     }
     groups: dict[object, list[InputPhoto]] = {}

@@ -28,7 +28,7 @@ from filelock import FileLock, Timeout
 
 from nexwarp import errors
 from nexwarp.data.sfm.frames import FrameChoice, check_frames, take_frames
-from nexwarp.data.sfm.photos import list_photos
+from nexwarp.data.sfm.photos import SECOND, list_photos
 from nexwarp.data.sfm.report import EstimatedCamera, SfmOptions, SfmReport
 from nexwarp.data.sfm.stages import PYCOLMAP, Observer, Stages
 from nexwarp.errors import NexwarpError, SceneError, StorageError
@@ -59,6 +59,7 @@ class Order:
 
     source: str  # the video, or the folder of the photos
     photos: list[str]  # names of the photos; none for a video
+    skipped: dict[str, str]  # name -> reason, of those in formats that cannot be read
     folder: str  # to work in; the scene is made in its subfolder scene/
     frames: int  # number of parts of a video
     options: JsonObject  # of `SfmOptions`
@@ -77,7 +78,8 @@ def process(
     """Estimate the cameras and points of a video or of photos, and write a COLMAP scene for `load_scene`.
 
     Of a video, `take_frames` takes sharp frames that differ, which are then compared with their neighbours in time
-    only, unless the options say otherwise. Photos are all used; blurred and repeated ones are named.
+    only, unless the options say otherwise. Of photos all that can be read are used, turned upright by EXIF; blurred and
+    repeated ones are named.
 
     The scene holds images/ (undistorted, with the given names), sparse/0 (PINHOLE cameras) and sfm.json (the report,
     the options, and size and SHA-256 of each file). It is made in a folder beside `scene`, which no second call for the
@@ -99,8 +101,9 @@ def process(
     Raises:
         FileNotFoundError: no such `source`.
         FileExistsError: `scene` exists, may not be replaced, or is being made by another process.
-        ValueError: an option out of range, fewer than 3 photos, a photo that cannot be decoded, has a name that no
-            scene can have, is a link out of the folder, or changed meanwhile, photos of one camera that differ in size,
+        ValueError: an option out of range, fewer than 3 photos that can be read, a photo that cannot (`strict`), has a
+            name that no scene can have, is a link out of the folder, or changed meanwhile, photos of one camera that
+            differ in size,
             a video that is damaged or shows fewer than 3 sharp frames, or no model was found; then the message gives
             advice.
         StorageError: the disk is full.
@@ -110,7 +113,9 @@ def process(
     scene = Path(scene).resolve() if Path(scene).is_symlink() else Path(scene)
     options.check()
     video = source.is_file()
-    names: list[str] = [] if video else list_photos(source)
+    names, skipped = ([], {}) if video else list_photos(source)
+    if options.strict and (name := next((name for name in skipped if skipped[name] != SECOND), None)):
+        raise SceneError(f"{source / name}: {skipped[name]}")
     if video:
         check_frames(source, frames)
     _check_target(source, scene, overwrite)
@@ -118,7 +123,7 @@ def process(
     before = {file: _identity(file) for file in inputs}
     with _claimed(scene) as folder:
         identity = source_identity(source)
-        order = Order(str(source.absolute()), names, str(folder), frames, asdict(options), identity)
+        order = Order(str(source.absolute()), names, skipped, str(folder), frames, asdict(options), identity)
         try:
             report = _in_child(order, scene, observe)
         except Exception:
@@ -143,7 +148,7 @@ def reconstruct(
 
 def source_identity(source: Path) -> dict[str, Json]:
     """Return name, size and time of a video, or of all photos of a folder, by which a scene tells its source."""
-    photos = [source / name for name in list_photos(source)] if source.is_dir() else []
+    photos = [source / name for name in list_photos(source)[0]] if source.is_dir() else []
     states = [file.stat() for file in photos or [source]]
     size, modified = sum(state.st_size for state in states), max(state.st_mtime for state in states)
     count: dict[str, Json] = {"photos": len(photos)} if photos else {}
@@ -294,7 +299,8 @@ def _make(order: Order, observe: Observer) -> dict[str, object]:
         source, names = photos, sorted(file.name for file in photos.iterdir())
         if options.matching == "auto":
             options = replace(options, matching="sequential")
-    report = replace(Stages(source, folder, options, observe).run(names), frames=choice)
+    report = Stages(source, folder, options, observe).run(names)
+    report = replace(report, frames=choice, skipped=order.skipped | report.skipped)
     if choice is not None:  # it names those that were left out
         report = replace(report, blurred=[], repeated=[])
     scene = folder / "scene"

@@ -1,11 +1,12 @@
 """The settings and the report of a reconstruction: registered photos, reasons for the others, advice."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal, get_args
 
 import tyro
 
+from nexwarp.data.capture import short
 from nexwarp.data.sfm.frames import FrameChoice
 
 Cameras = Literal["auto", "single", "folder", "image"]
@@ -40,6 +41,8 @@ class SfmOptions:
     """CPU threads; with 1 thread the same photos give the same scene, bit for bit."""
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
     """Random seed."""
+    strict: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = False
+    """Stop at the first photo that cannot be read, instead of leaving it out."""
 
     def check(self) -> None:
         """Raise ValueError, naming the option, when a value is out of range or unknown."""
@@ -96,6 +99,7 @@ class SfmReport:
     blurred: list[str]  # names of photos that are much less sharp than the others; they are used all the same
     repeated: list[str]  # names of photos that show nearly the same as the one before; they are used all the same
     frames: FrameChoice | None = None  # the frames of a video; None for photos
+    skipped: dict[str, str] = field(default_factory=dict)  # name -> reason, for each photo that was not read
 
     def rows(self) -> dict[str, str]:
         """The figures as rows of a table: name -> text."""
@@ -122,7 +126,12 @@ class SfmReport:
 
     def lines(self) -> list[str]:
         """What is suspicious, the photos that were left out, and the advice, one line each."""
-        lines = [f"blurred: {name}; kept" for name in self.blurred]
+        lines = []
+        for reason in list(dict.fromkeys(self.skipped.values())):
+            names = [short(name) for name in self.skipped if self.skipped[name] == reason]
+            more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+            lines.append(f"skipped {len(names)}: {', '.join(names[:LISTED])}{more}: {reason}")
+        lines += [f"blurred: {name}; kept" for name in self.blurred]
         lines += [f"repeats the photo before: {name}; kept" for name in self.repeated]
         names = list(self.left_out)
         lines += [f"left out: {name}: {self.left_out[name]}" for name in names[:LISTED]]

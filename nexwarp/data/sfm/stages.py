@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from nexwarp.data.colmap import read_model
 from nexwarp.data.images import read_image
 from nexwarp.data.lens import pycolmap_module
-from nexwarp.data.sfm.photos import InputPhoto, affordable_threads, camera_groups, camera_model, judged, read_photos
+from nexwarp.data.sfm.photos import (
+    InputPhoto,
+    affordable_threads,
+    camera_groups,
+    camera_model,
+    is_copied,
+    judged,
+    read_each,
+    read_photos,
+)
 from nexwarp.data.sfm.report import EstimatedCamera, Overlaps, SfmOptions, SfmReport, advise, left_out
 from nexwarp.io.files import one_line
 
@@ -47,6 +56,10 @@ class Stages:
     observe: Observer
     seconds: dict[str, float] = field(default_factory=dict)
     decoders: int = 1  # threads that may each hold a photo
+    readable: Path = field(init=False)  # folder that pycolmap reads: `photos`, or links and upright copies of them
+
+    def __post_init__(self) -> None:
+        self.readable = self.photos
 
     @property
     def threads(self) -> int:
@@ -61,10 +74,11 @@ class Stages:
     def run(self, names: Sequence[str]) -> SfmReport:
         """Reconstruct the photos of these names, and return the report."""
         pycolmap_module().logging.minloglevel = ONLY_FATAL
-        self.decoders = affordable_threads(self.photos, names, self.options)
-        with self._stage("reading", len(names)) as done:
-            photos = read_photos(self.photos, names, self.decoders, done)
+        given = len(names)
+        with self._stage("reading", given) as done:
+            photos, skipped = self._read(names, done)
             groups = camera_groups(self.photos, photos, self.options.cameras)
+        names = [photo.name for photo in photos]
         with self._stage("features", len(names)) as done:
             self._import(groups)
             self._extract(names, done)
@@ -85,7 +99,7 @@ class Stages:
             self._check(done)
         blurred, repeated = judged(photos)
         return SfmReport(
-            photos=len(names),
+            photos=given,
             registered=[name for name in names if name in set(registered)],
             left_out=left_out(overlaps, registered, [_names(model) for model in models]),
             points=models[0].num_points3D(),
@@ -101,6 +115,7 @@ class Stages:
             advice=advise(overlaps, len(registered)),
             blurred=blurred,
             repeated=repeated,
+            skipped=skipped,
         )
 
     @contextmanager
@@ -111,6 +126,16 @@ class Stages:
         self.observe(title, total, total)
         self.seconds[title] = time.perf_counter() - start
 
+    def _read(self, names: Sequence[str], done: Callable[[int], None]) -> tuple[list[InputPhoto], dict[str, str]]:
+        """Decode the photos, and prepare them for pycolmap if any is turned or converted."""
+        strict = self.options.strict
+        copied, damaged = read_each(self.photos, names, lambda name: is_copied(self.photos / name), strict)
+        self.decoders = affordable_threads(self.photos, list(copied), self.options)
+        prepared = self.folder / "photos" if any(copied.values()) else None
+        self.readable = prepared or self.photos
+        photos, more = read_photos(self.photos, list(copied), self.decoders, done, prepared, strict)
+        return photos, damaged | more
+
     def _import(self, groups: Sequence[Sequence[InputPhoto]]) -> None:
         """Enter photos and cameras in the database, in a fixed order, since the mapper's result depends on it."""
         with open_database(self.database):  # creates the file
@@ -120,7 +145,7 @@ class Stages:
         for group in groups:
             names = [photo.name for photo in group]
             reader.camera_model = camera_model(group, self.options)
-            run_stage("features", partial(pycolmap.import_images, self.database, self.photos, single, names, reader))
+            run_stage("features", partial(pycolmap.import_images, self.database, self.readable, single, names, reader))
         by_name = {photo.name: group for group in groups for photo in group}
         with open_database(self.database) as database:
             camera_of = {image.camera_id: by_name[image.name] for image in database.read_all_images()}
@@ -144,7 +169,7 @@ class Stages:
             run_stage(
                 "features",
                 lambda: pycolmap.extract_features(
-                    self.database, self.photos, list(names), extraction_options=extraction, device=pycolmap.Device.cpu
+                    self.database, self.readable, list(names), extraction_options=extraction, device=pycolmap.Device.cpu
                 ),
                 lambda: done(count()),
             )
@@ -214,7 +239,7 @@ class Stages:
             "mapping",
             lambda: pycolmap.incremental_mapping(
                 self.database,
-                self.photos,
+                self.readable,
                 self.folder / "models",
                 options,
                 initial_image_pair_callback=first_pair,
@@ -241,7 +266,7 @@ class Stages:
         run_stage(
             "undistorting",
             lambda: pycolmap.undistort_images(
-                output, chosen, self.photos, jpeg_quality=JPEG_QUALITY, num_threads=self.decoders
+                output, chosen, self.readable, jpeg_quality=JPEG_QUALITY, num_threads=self.decoders
             ),
             lambda: done(sum(len(files) for _, _, files in os.walk(output / "images"))),
         )
