@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "requirements"
 # torch and CUDA are on their own, since many users have another build of torch, with other hashes.
 TORCH = re.compile(r"torch==|triton==|nvidia-|cuda-")
-EXTRAS = ("viewer", "video", "tensorboard", "flip", "glb", "splats")  # of users, in run.txt
+EXTRAS = ("viewer", "video", "tensorboard", "flip", "glb", "splats", "usd")  # of users, in run.txt
 HEADERS = {
     "torch": "torch and its CUDA libraries.",
     "run": f"What nexwarp and its extras {', '.join(EXTRAS)} need beside torch.txt.",

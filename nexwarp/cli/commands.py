@@ -241,16 +241,17 @@ class Export:
     """Export a run to the formats of other programs. docs/outputs.md describes the files.
 
     ply: surfels.ply, all properties of the surfels, and splats.ply, for viewers of 3D Gaussian splatting. spz: the
-    same Gaussians at a tenth of the size (extra `splats`). mesh: triangles with colours. compact: the model in a
-    fifth of its size. cameras: for nerfstudio. web: a web page that shows the scene in any browser. glb: for
-    Blender and three.js (extra `glb`).
+    same Gaussians at a tenth of the size (extra `splats`). gltf-splats: the same for programs that read glTF. mesh:
+    triangles with colours. compact: the model in a fifth of its size. cameras: for nerfstudio. web: a web page that
+    shows the scene in any browser. glb: for Blender and three.js (extra `glb`). usd: for Omniverse and other programs
+    that read USD (extra `usd`).
     """
 
     run: Run_
     """Run folder, or a model's folder or .safetensors file."""
     files: tyro.conf.OmitArgPrefixes[ExportOrder] = dataclasses.field(default_factory=ExportOrder)
     device: Device_ = None
-    """Device for mesh, web and glb, which render."""
+    """Device for mesh, web, glb and usd, which render."""
 
     def __call__(self, console: Console) -> None:
         """Export."""

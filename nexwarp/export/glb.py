@@ -70,7 +70,7 @@ def save_glb(path: str | os.PathLike[str], scene: BakedScene, cameras: Sequence[
 
     if not len(scene.shape.means):
         raise FormatError(f"{path}: expected surfels with an opacity above {CUTOFF}, which glTF shows; found none")
-    corners, places, faces = _quads(scene)
+    corners, places, faces = quads(scene)
     mode = {"alphaMode": "BLEND"} if scene.cut is None else {"alphaMode": "MASK", "alphaCutoff": scene.cut.cutoff}
     material = trimesh.visual.material.PBRMaterial(
         name="surfels",
@@ -97,7 +97,7 @@ def upright(cameras: Sequence[Camera]) -> np.ndarray:
     return np.stack([side, up, np.cross(side, up)])
 
 
-def _quads(scene: BakedScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def quads(scene: BakedScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return corners (4 M, 3) in the world, their texture coordinates (4 M, 2) from the bottom left, faces (2 M, 3)."""
     shape, rects = scene.shape, scene.rects.double()
     sides = torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]], device=rects.device)

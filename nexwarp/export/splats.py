@@ -1,4 +1,4 @@
-"""Surfels as files: PLY with all parameters, and Gaussians for viewers of 3D Gaussian splatting, as PLY or SPZ.
+"""Surfels as files: PLY with all parameters, and Gaussians for viewers of splats, as PLY, SPZ or glTF.
 
 PLY files are little-endian lists of vertices whose properties have one floating type. Names and activations are those
 of 3DGS's files: `opacity` is a logit, `scale_*` are logarithms, `rot_*` is a quaternion wxyz, surfel to world, `f_dc_*`
@@ -10,8 +10,10 @@ alpha approximates the surfel's.
 """
 
 import gzip
+import json
 import math
 import os
+import struct
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
@@ -26,13 +28,16 @@ import torch
 from nexwarp.cameras.camera import Camera
 from nexwarp.errors import FormatError
 from nexwarp.export.bake import points_on
+from nexwarp.export.glb import upright
 from nexwarp.io.files import one_line, write_atomically
 from nexwarp.io.ply import write_elements
+from nexwarp.kernels.sh import BAND_0
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN
 from nexwarp.model.surfels import Surfels
 
 MAX_EXTENT = 0.3  # largest scale of an exported Gaussian, as a fraction of its distance to the nearest camera
 THINNESS = 1e-3  # third scale of an exported Gaussian, as a fraction of the surfel's smaller scale
+SPLATTING = "KHR_gaussian_splatting"  # extension of glTF
 SPLAT_DEGREE = 3  # SH degree whose coefficients viewers expect
 SURFELS = "nexwarp surfels: gamma = 1 + exp(gamma_i), scale = exp(scale_i), opacity = sigmoid(opacity), rot is wxyz"
 SPLATS = "nexwarp surfels as 3DGS Gaussians: the plain appearance, without texture, with gamma = 1"
@@ -74,6 +79,44 @@ def save_surfels_ply(path: str | os.PathLike[str], surfels: Surfels) -> None:
     write_elements(path, {"vertex": _columns(groups)}, SURFELS)
 
 
+@dataclass(frozen=True)
+class Gaussians:
+    """M Gaussians that show the plain appearance of surfels.
+
+    Attributes:
+        means: (M, 3) centres, world units.
+        normals: (M, 3) unit normals.
+        quats: (M, 4) unit quaternions wxyz, Gaussian to world.
+        log_scales: (M, 3) logarithms of the standard deviations, the third thin.
+        logit_opacities: (M,)
+        sh: (M, 16, 3) coefficients; those above the given degree are 0.
+    """
+
+    means: torch.Tensor
+    normals: torch.Tensor
+    quats: torch.Tensor
+    log_scales: torch.Tensor
+    logit_opacities: torch.Tensor
+    sh: torch.Tensor
+
+
+@torch.no_grad()
+def gaussians(surfels: Surfels, sh_degree: int, cameras: Sequence[Camera], max_extent: float) -> Gaussians:
+    """Return surfels as Gaussians; large ones become several, which come last."""
+    raw = surfels.state_dict()
+    pieces = split_large(surfels.means, surfels.scales, surfels.opacities, cameras, max_extent)
+    ids, whole = pieces.ids, pieces.whole
+    means = raw["means"][ids]
+    means[whole:] = points_on(surfels, ids[whole:], pieces.offsets[whole:])
+    sh = raw["sh0"].new_zeros(len(surfels), (SPLAT_DEGREE + 1) ** 2, 3)
+    kept = torch.cat([raw["sh0"], raw["shN"]], dim=1)[:, : (sh_degree + 1) ** 2]
+    sh[:, : kept.shape[1]] = kept
+    scales = torch.cat([raw["log_scales"][ids[:whole]], pieces.scales[whole:].log()])
+    thin = scales.amin(dim=1, keepdim=True) + math.log(THINNESS)
+    logits = torch.cat([raw["logit_opacities"][ids[:whole]], pieces.opacities[whole:].logit()])
+    return Gaussians(means, surfels.normals[ids], surfels.quats[ids], torch.cat([scales, thin], 1), logits, sh[ids])
+
+
 def save_splats_ply(
     path: str | os.PathLike[str],
     surfels: Surfels,
@@ -91,23 +134,15 @@ def save_splats_ply(
     Properties: `x y z`, `nx ny nz`, `f_dc_0..2`, `f_rest_0..44`, `opacity` (logit), `scale_0..2` (logarithms),
     `rot_0..3` (wxyz, unit), all float32.
     """
-    raw = surfels.state_dict()
-    pieces = split_large(surfels.means, surfels.scales, surfels.opacities, cameras, max_extent)
-    ids, whole = pieces.ids, pieces.whole
-    means = raw["means"][ids]
-    means[whole:] = points_on(surfels, ids[whole:], pieces.offsets[whole:])
-    rest = raw["shN"].new_zeros(len(surfels), (SPLAT_DEGREE + 1) ** 2 - 1, 3)
-    kept = raw["shN"][:, : (sh_degree + 1) ** 2 - 1]
-    rest[:, : kept.shape[1]] = kept
-    scales = torch.cat([raw["log_scales"][ids[:whole]], pieces.scales[whole:].log()])
+    found = gaussians(surfels, sh_degree, cameras, max_extent)
     groups = {
-        "x y z": means,
-        "nx ny nz": surfels.normals[ids],
-        "f_dc": raw["sh0"][ids, 0],
-        "f_rest": rest[ids].mT.flatten(1),
-        "opacity": torch.cat([raw["logit_opacities"][ids[:whole]], pieces.opacities[whole:].logit()]),
-        "scale": torch.cat([scales, scales.amin(dim=1, keepdim=True) + math.log(THINNESS)], dim=1),
-        "rot": surfels.quats[ids],
+        "x y z": found.means,
+        "nx ny nz": found.normals,
+        "f_dc": found.sh[:, 0],
+        "f_rest": found.sh[:, 1:].mT.flatten(1),
+        "opacity": found.logit_opacities,
+        "scale": found.log_scales,
+        "rot": found.quats,
     }
     columns = _columns({name: values.float() for name, values in groups.items()})
     write_elements(path, {"vertex": columns}, SPLATS)
@@ -121,6 +156,66 @@ def _columns(groups: Mapping[str, torch.Tensor]) -> dict[str, np.ndarray]:
         names = group.split() if " " in group or values.ndim == 1 else numbered
         columns |= zip(names, values.detach().cpu().numpy().reshape(len(values), len(names)).T, strict=True)
     return columns
+
+
+def save_splats_glb(
+    path: str | os.PathLike[str],
+    surfels: Surfels,
+    sh_degree: int = SPLAT_DEGREE,
+    *,
+    cameras: Sequence[Camera] = (),
+    max_extent: float = MAX_EXTENT,
+) -> None:
+    """Write the Gaussians of `save_splats_ply`, whose arguments these are, as glTF with KHR_gaussian_splatting.
+
+    The file is binary glTF 2.0: one primitive of points, which programs without the extension show in the colours of
+    COLOR_0. The mean of the cameras' upward directions becomes +y, by the node. FormatError: there are no surfels.
+    """
+    if not len(surfels):
+        raise FormatError(f"{path}: expected surfels to write, the model has none")
+    found = gaussians(surfels, sh_degree, cameras, max_extent)
+    opacities = found.logit_opacities.sigmoid()
+    display = (BAND_0 * found.sh[:, 0] + 0.5).clamp(0, 1)
+    linear = torch.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+    attributes = {
+        "POSITION": found.means,
+        "COLOR_0": torch.cat([linear, opacities[:, None]], dim=1),
+        f"{SPLATTING}:ROTATION": found.quats.roll(-1, 1),  # xyzw
+        f"{SPLATTING}:SCALE": found.log_scales.exp(),
+        f"{SPLATTING}:OPACITY": opacities,
+    }
+    for degree in range(sh_degree + 1):
+        for n in range(2 * degree + 1):
+            attributes[f"{SPLATTING}:SH_DEGREE_{degree}_COEF_{n}"] = found.sh[:, degree**2 + n]
+    arrays = {name: values.float().cpu().contiguous().numpy() for name, values in attributes.items()}
+    kinds = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4"}
+    accessors, views, offset = [], [], 0
+    for number, array in enumerate(arrays.values()):
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": array.nbytes})
+        kind = kinds[array.shape[1:]]
+        accessors.append({"bufferView": number, "componentType": 5126, "count": len(array), "type": kind})
+        offset += array.nbytes
+    accessors[0] |= {"min": arrays["POSITION"].min(0).tolist(), "max": arrays["POSITION"].max(0).tolist()}
+    kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"mode": 0, "attributes": {name: i for i, name in enumerate(arrays)}, "extensions": {SPLATTING: kernel}}
+    turn = np.eye(4)
+    turn[:3, :3] = upright(cameras)
+    tree = {
+        "asset": {"version": "2.0", "generator": "nexwarp"},
+        "extensionsUsed": [SPLATTING],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "matrix": turn.T.flatten().tolist()}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
+    }
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    header = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + offset)
+    chunks = (struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", offset, b"BIN\0"))
+    write_atomically(Path(path), b"".join([header, *chunks, *(array.tobytes() for array in arrays.values())]))
 
 
 def save_splats_spz(

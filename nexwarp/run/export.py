@@ -20,15 +20,25 @@ from nexwarp.errors import RunError, SettingError
 from nexwarp.export.bake import Progress, bake
 from nexwarp.export.glb import ALPHAS, make_cards, save_glb
 from nexwarp.export.mesh import extract_mesh, save_mesh
-from nexwarp.export.splats import MAX_EXTENT, SPLAT_DEGREE, save_splats_ply, save_splats_spz, save_surfels_ply
+from nexwarp.export.splats import (
+    MAX_EXTENT,
+    SPLAT_DEGREE,
+    save_splats_glb,
+    save_splats_ply,
+    save_splats_spz,
+    save_surfels_ply,
+)
+from nexwarp.export.usd import save_usdz
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import JsonObject, write_json
 from nexwarp.model.compact import NOISE, NOISES
 from nexwarp.model.model_file import save_model
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
 
-PACKAGES = {"glb": ("trimesh", "glb"), "spz": ("gaussforge", "splats")}  # that formats need, and their extras
-RENDERED = ("mesh", "web", "glb")  # formats that are made of renderings, stage by stage
+# Packages that formats need, and their extras.
+PACKAGES = {"glb": ("trimesh", "glb"), "spz": ("gaussforge", "splats"), "usd": ("pxr", "usd")}
+SPLAT_WRITERS = {"ply": save_splats_ply, "spz": save_splats_spz, "gltf-splats": save_splats_glb}
+RENDERED = ("mesh", "web", "glb", "usd")  # formats that are made of renderings, stage by stage
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows
 
 
@@ -37,13 +47,13 @@ class ExportOrder:
     """What `nexwarp export` writes."""
 
     format: Annotated[str, arg(metavar="NAME")] = "ply"
-    """ply, mesh, compact, cameras, web, glb or spz."""
+    """ply, mesh, compact, cameras, web, glb, usd, spz or gltf-splats."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: RUN/export)")] = None
     """Output folder; with --format web also NAME.html, for one file with everything."""
     quality: Annotated[str, arg(metavar="{quantised,full}")] = "quantised"
     """Of --format web: quantised files are a fifth to a half as large."""
     alpha: Annotated[str, arg(metavar="{mask,blend}")] = "mask"
-    """Of glb: mask cuts surfels out, which all programs draw; blend is closer to the photos, in those that sort."""
+    """Of glb, usd: mask cuts surfels out, which all programs draw; blend is closer to photos, in those that sort."""
     noise: Annotated[float | None, arg(metavar="X", help_behavior_hint="(default: 8 % of the test views' error)")] = (
         None
     )
@@ -118,18 +128,33 @@ def _export(
         save_mesh(files[0], extract_mesh(model, [*trained.values()], voxel=order.voxel, far=order.far, observe=observe))
     elif order.format == "compact":
         save_model(files[0], opened.model, compact=_noise(opened) if order.noise is None else order.noise)
-    elif order.format == "glb":
-        if not views:
-            raise RunError(f"{opened.path}: --format glb: expected the run's {CAMERAS_FILE}, found none")
-        cameras = list(views.values())
-        save_glb(files[0], make_cards(bake(opened.model.to(device), cameras, progress=observe), order.alpha), cameras)
     else:
-        surfels, degree = opened.model.surfels, min(opened.model.options.sh_degree, SPLAT_DEGREE)
-        if order.format == "ply":
-            save_surfels_ply(files[0], surfels)
-        save = save_splats_ply if order.format == "ply" else save_splats_spz
-        save(files[-1], surfels, degree, cameras=list(views.values()), max_extent=order.max_extent)
+        _export_geometry(opened, order, files, list(views.values()), device, observe)
     return files
+
+
+def _export_geometry(
+    opened: OpenedModel,
+    order: ExportOrder,
+    files: Sequence[Path],
+    cameras: list[Camera],
+    device: torch.device | str,
+    observe: Progress,
+) -> None:
+    """Write surfels as textured cards or as Gaussians."""
+    surfels, degree = opened.model.surfels, min(opened.model.options.sh_degree, SPLAT_DEGREE)
+    if order.format in ("glb", "usd"):
+        if not cameras:
+            raise RunError(f"{opened.path}: --format {order.format}: expected the run's {CAMERAS_FILE}, found none")
+        cards = make_cards(bake(opened.model.to(device), cameras, progress=observe), order.alpha)
+        if order.format == "glb":
+            save_glb(files[0], cards, cameras)
+        else:
+            save_usdz(files[0], cards, surfels, degree, cameras)
+        return
+    if order.format == "ply":
+        save_surfels_ply(files[0], surfels)
+    SPLAT_WRITERS[order.format](files[-1], surfels, degree, cameras=cameras, max_extent=order.max_extent)
 
 
 def _noise(opened: OpenedModel) -> float:

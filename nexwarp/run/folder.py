@@ -55,7 +55,9 @@ EXPORTS = {
     "cameras": ("transforms.json", "camera_path.json"),
     "web": ("scene.html",),
     "glb": ("scene.glb",),
+    "usd": ("scene.usdz",),
     "spz": ("splats.spz",),
+    "gltf-splats": ("splats.glb",),
 }
 
 RENDERS_FOLDER = "renders"

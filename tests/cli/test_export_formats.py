@@ -24,12 +24,16 @@ def test_a_finished_run_becomes_a_web_page(finished, capsys):
     assert "<title>tiny</title>" in (finished / "page" / "index.html").read_text()
 
 
-def test_a_finished_run_becomes_gltf_and_spz(finished, monkeypatch, capsys):
+def test_a_finished_run_becomes_gltf_usd_and_spz(finished, monkeypatch, capsys):
     pytest.importorskip("trimesh")
     refused(capsys, ["export", str(finished), "--format", "glb", "--device", "cpu"], "scene.glb", "opacity above 0.3")
     assert not (finished / "export").exists()
     monkeypatch.setattr("nexwarp.export.glb.CUTOFF", 0.05)  # surfels of a short training are faint
-    for package, kind, name in (("trimesh", "glb", "scene.glb"), ("gaussforge", "spz", "splats.spz")):
+    for package, kind, name in (
+        ("trimesh", "glb", "scene.glb"),
+        ("gaussforge", "spz", "splats.spz"),
+        ("pxr", "usd", "scene.usdz"),
+    ):
         pytest.importorskip(package)
         assert cli.main(["export", str(finished), "--format", kind, "--device", "cpu"]) == 0
         assert (finished / "export" / name).stat().st_size > 100

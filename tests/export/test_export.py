@@ -1,5 +1,7 @@
 """Exported surfels and meshes: what independent readers and an independent renderer make of the files."""
 
+import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +10,17 @@ import torch
 
 import nexwarp as nw
 from nexwarp.cameras.paths import look_at
-from nexwarp.errors import RunError, SettingError
+from nexwarp.errors import FormatError, RunError, SettingError
 from nexwarp.export.mesh import Mesh, _surface, _without_crumbs, extract_mesh, save_mesh
-from nexwarp.export.splats import THINNESS, Pieces, save_splats_ply, save_surfels_ply, split_large
+from nexwarp.export.splats import (
+    SPLATTING,
+    THINNESS,
+    Pieces,
+    save_splats_glb,
+    save_splats_ply,
+    save_surfels_ply,
+    split_large,
+)
 from nexwarp.io.pictures import to_uint8
 from nexwarp.ops.tsdf import DistanceField
 from nexwarp.run.evaluate import psnr
@@ -90,6 +100,52 @@ def test_splats_are_flat_gaussians(tmp_path: Path, given: int, kept: int) -> Non
     count = (min(given, kept) + 1) ** 2
     assert coefficients[:, : count - 1].equal(scene["sh"][:, 1:count]) and (coefficients[:, count - 1 :] == 0).all()
     assert stack(columns, *numbered("f_dc", 3)).equal(scene["sh"][:, 0])
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gltf_holds_the_gaussians_of_the_ply(tmp_path: Path, degree: int) -> None:
+    """By the ratified KHR_gaussian_splatting: linear scales, opacities in [0, 1], quaternions xyzw."""
+    surfels = make_surfels(random_scene(sh_degree=3))
+    save_splats_ply(tmp_path / "a.ply", surfels, degree, cameras=[CAMERA])
+    save_splats_glb(tmp_path / "a.glb", surfels, degree, cameras=[CAMERA])
+    columns, content = read(tmp_path / "a.ply"), (tmp_path / "a.glb").read_bytes()
+    assert struct.unpack_from("<4sII", content) == (b"glTF", 2, len(content))
+    length, kind = struct.unpack_from("<I4s", content, 12)
+    tree, start = json.loads(content[20 : 20 + length]), 20 + length
+    assert kind == b"JSON" and length % 4 == 0
+    assert struct.unpack_from("<I4s", content, start) == (len(content) - start - 8, b"BIN\0")
+    assert tree["buffers"] == [{"byteLength": len(content) - start - 8}]
+    primitive = tree["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0 and tree["extensionsUsed"] == list(primitive["extensions"])
+    assert primitive["extensions"][SPLATTING] == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    sizes, found = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}, {}
+    for name, number in primitive["attributes"].items():
+        accessor = tree["accessors"][number]
+        view = tree["bufferViews"][accessor["bufferView"]]
+        assert accessor["componentType"] == 5126 and view["byteOffset"] % 4 == 0
+        values = torch.frombuffer(
+            bytearray(content),
+            dtype=torch.float32,
+            offset=start + 8 + view["byteOffset"],
+            count=view["byteLength"] // 4,
+        )
+        found[name.removeprefix(f"{SPLATTING}:")] = values.view(accessor["count"], sizes[accessor["type"]])
+    assert found["POSITION"].equal(stack(columns, "x", "y", "z"))
+    corners = tree["accessors"][primitive["attributes"]["POSITION"]]
+    assert corners["min"] == found["POSITION"].amin(0).tolist() and corners["max"] == found["POSITION"].amax(0).tolist()
+    assert_close(found["SCALE"], stack(columns, *numbered("scale", 3)).exp(), kind="value", name="scale")
+    assert_close(found["OPACITY"][:, 0], columns["opacity"].sigmoid(), kind="value", name="opacity")
+    assert found["ROTATION"].equal(stack(columns, "rot_1", "rot_2", "rot_3", "rot_0"))
+    names = [f"SH_DEGREE_{d}_COEF_{n}" for d in range(degree + 1) for n in range(2 * d + 1)]
+    assert names == [name for name in found if name.startswith("SH")]
+    assert found[names[0]].equal(stack(columns, *numbered("f_dc", 3)))
+    rest = stack(columns, *numbered("f_rest", 45)).view(-1, 3, 15)
+    assert all(found[name].equal(rest[..., i]) for i, name in enumerate(names[1:]))
+    shown = (0.5 + 0.28209479177387814 * found[names[0]]).clamp(0, 1)
+    linear = (found["COLOR_0"][:, :3] - shown.pow(2.2)).abs()
+    assert linear.max() < 0.01 and found["COLOR_0"][:, 3:].equal(found["OPACITY"])
+    with pytest.raises(FormatError, match="expected surfels"):
+        save_splats_glb(tmp_path / "none.glb", make_surfels(random_scene(0)))
 
 
 # Large surfels become several Gaussians

@@ -341,7 +341,8 @@ def test_cameras_that_no_path_suits(refuses: Callable[..., None], run: Path) -> 
 
 def test_bad_exports(refuses: Callable[..., None], run: Path, tmp_path: Path) -> None:
     refuses(
-        ["export", "--format", "obj"], "--format: expected one of ply, mesh, compact, cameras, web, glb, spz, got 'obj'"
+        ["export", "--format", "obj"],
+        "--format: expected one of ply, mesh, compact, cameras, web, glb, usd, spz, gltf-splats, got 'obj'",
     )
     (run / "cameras.json").write_text("{}")
     refuses(["export", "--format", "cameras"], "cameras.json: expected at least one camera, found none")

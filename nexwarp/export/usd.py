@@ -1,0 +1,147 @@
+"""The baked scene and the surfels as a USDZ file, for programs of film and of simulation."""
+
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from nexwarp.cameras.camera import Camera
+from nexwarp.errors import FormatError
+from nexwarp.export.baked_scene import BakedScene
+from nexwarp.export.glb import quads, upright
+from nexwarp.export.splats import gaussians
+from nexwarp.io.files import write_atomically
+from nexwarp.io.pictures import to_uint8
+from nexwarp.model.surfels import Surfels
+
+if TYPE_CHECKING:
+    from pxr import Usd, UsdGeom, Vt
+
+ROOT, VARIANTS = "/Scene", "shown"
+
+
+@torch.no_grad()
+def save_usdz(
+    path: str | os.PathLike[str], scene: BakedScene, surfels: Surfels, sh_degree: int, cameras: Sequence[Camera]
+) -> None:
+    """Write cards and surfels as one USDZ file, atomically; the default prim's variant `shown` chooses between them.
+
+    `Cards`, which is shown at first, is a mesh of quads with one unlit UsdPreviewSurface. `Surfels` is a particle field
+    with the kernel of Gaussian surflets: the plain appearance, with gamma = 1, and SH up to `sh_degree`. The mean of
+    the cameras' upward directions becomes +y, by the default prim. FormatError: there are no cards.
+    """
+    from PIL import Image
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils
+
+    if not len(scene.shape.means):
+        raise FormatError(f"{path}: expected surfels that are opaque enough to be seen, found none")
+    with tempfile.TemporaryDirectory() as folder:
+        Image.fromarray(to_uint8(scene.texels).cpu().numpy(), "RGBA").save(Path(folder, "atlas.png"))
+        stage = Usd.Stage.CreateNew(str(Path(folder, "scene.usdc")))
+        UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        root = UsdGeom.Xform.Define(stage, ROOT)
+        stage.SetDefaultPrim(root.GetPrim())
+        turn = np.eye(4)
+        turn[:3, :3] = upright(cameras)
+        root.AddTransformOp().Set(Gf.Matrix4d(turn.T.tolist()))  # of row vectors
+        forms = {"cards": _cards(stage, scene), "surfels": _particles(stage, surfels, sh_degree)}
+        choice = root.GetPrim().GetVariantSets().AddVariantSet(VARIANTS)
+        for name in forms:
+            choice.AddVariant(name)
+            choice.SetVariantSelection(name)
+            with choice.GetVariantEditContext():
+                for other, form in forms.items():
+                    shown = UsdGeom.Tokens.inherited if other == name else UsdGeom.Tokens.invisible
+                    form.CreateVisibilityAttr(shown)
+        choice.SetVariantSelection("cards")
+        stage.GetRootLayer().Save()
+        packed = Path(folder, "scene.usdz")
+        if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(Path(folder, "scene.usdc"))), str(packed)):
+            raise OSError(f"{path}: usd-core could not pack it")
+        write_atomically(Path(path), packed.read_bytes())
+
+
+def _cards(stage: "Usd.Stage", scene: BakedScene) -> "UsdGeom.Gprim":
+    """Define the mesh of the cards and its material."""
+    from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
+
+    corners, places, _ = quads(scene)
+    mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/Cards")
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(corners.astype(np.float32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(corners) // 4, 4, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.arange(len(corners), dtype=np.int32)))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateDoubleSidedAttr(True)
+    mesh.CreateExtentAttr(_extent(corners))
+    interface = UsdGeom.PrimvarsAPI(mesh)
+    kind = Sdf.ValueTypeNames.TexCoord2fArray
+    st = interface.CreatePrimvar("st", kind, UsdGeom.Tokens.vertex)
+    st.Set(Vt.Vec2fArray.FromNumpy(places.astype(np.float32)))
+
+    material = UsdShade.Material.Define(stage, f"{ROOT}/Material")
+    shaders = {}
+    kinds = {"Surface": "UsdPreviewSurface", "Atlas": "UsdUVTexture", "St": "UsdPrimvarReader_float2"}
+    for name, identifier in kinds.items():
+        shaders[name] = UsdShade.Shader.Define(stage, f"{ROOT}/Material/{name}")
+        shaders[name].CreateIdAttr(identifier)
+    surface, atlas, reader = shaders.values()
+    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+    atlas.CreateInput("file", Sdf.ValueTypeNames.Asset).Set("atlas.png")
+    atlas.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
+    for side in ("wrapS", "wrapT"):
+        atlas.CreateInput(side, Sdf.ValueTypeNames.Token).Set("clamp")
+    places_input = atlas.CreateInput("st", Sdf.ValueTypeNames.Float2)
+    places_input.ConnectToSource(reader.CreateOutput("result", Sdf.ValueTypeNames.Float2))
+    # The colours have their light already: they are emitted, and nothing is reflected.
+    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(0.0))
+    surface.CreateInput("useSpecularWorkflow", Sdf.ValueTypeNames.Int).Set(1)
+    surface.CreateInput("specularColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(0.0))
+    emitted = surface.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f)
+    emitted.ConnectToSource(atlas.CreateOutput("rgb", Sdf.ValueTypeNames.Float3))
+    opacity = surface.CreateInput("opacity", Sdf.ValueTypeNames.Float)
+    opacity.ConnectToSource(atlas.CreateOutput("a", Sdf.ValueTypeNames.Float))
+    if scene.cut is not None:
+        surface.CreateInput("opacityThreshold", Sdf.ValueTypeNames.Float).Set(scene.cut.cutoff)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    return mesh
+
+
+def _particles(stage: "Usd.Stage", surfels: Surfels, sh_degree: int) -> "UsdGeom.Gprim":
+    """Define the particle field of the surfels."""
+    from pxr import UsdVol, Vt
+
+    found = gaussians(surfels, sh_degree, (), float("inf"))  # surflets are exact at any size
+    means, quats, scales, sh = (
+        x.float().cpu().numpy()
+        for x in (found.means, found.quats.roll(-1, 1), found.log_scales.exp(), found.sh[:, : (sh_degree + 1) ** 2])
+    )
+    opacities = found.logit_opacities.sigmoid().float().cpu().numpy()
+    field = UsdVol.ParticleField.Define(stage, f"{ROOT}/Surfels")
+    prim = field.GetPrim()
+    UsdVol.ParticleFieldKernelGaussianSurfletAPI.Apply(prim)
+    positions = UsdVol.ParticleFieldPositionAttributeAPI.Apply(prim)
+    positions.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(means))
+    orientations = UsdVol.ParticleFieldOrientationAttributeAPI.Apply(prim)
+    orientations.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(quats))
+    UsdVol.ParticleFieldScaleAttributeAPI.Apply(prim).CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scales))
+    UsdVol.ParticleFieldOpacityAttributeAPI.Apply(prim).CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(opacities))
+    radiance = UsdVol.ParticleFieldSphericalHarmonicsAttributeAPI.Apply(prim)
+    radiance.CreateRadianceSphericalHarmonicsDegreeAttr(sh_degree)
+    coefficients = np.ascontiguousarray(sh.reshape(-1, 3))
+    radiance.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(coefficients))
+    reach = 3 * scales.max(axis=1, keepdims=True)  # where the support ends
+    field.CreateExtentAttr(_extent(np.concatenate([means - reach, means + reach])))
+    return field
+
+
+def _extent(points: np.ndarray) -> "Vt.Vec3fArray":
+    """Return the corners of the box around points (N, 3)."""
+    from pxr import Gf, Vt
+
+    return Vt.Vec3fArray([Gf.Vec3f(*map(float, corner)) for corner in (points.min(0), points.max(0))])

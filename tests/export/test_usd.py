@@ -1,0 +1,92 @@
+"""USDZ files: valid by usd-core's own validators, with the cards and surfels of the model."""
+
+import io
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from nexwarp.errors import FormatError
+from nexwarp.export.bake import bake
+from nexwarp.export.glb import make_cards, quads, upright
+from nexwarp.export.usd import save_usdz
+from nexwarp.io.pictures import to_uint8
+from tests.export.test_bake import make_model
+from tests.export.web.support import ring
+from tests.tolerances import assert_close
+
+pytest.importorskip("pxr", reason="usd-core (extra `usd`)")
+
+
+@pytest.fixture
+def model():
+    return make_model()
+
+
+@pytest.fixture
+def views():
+    return list(ring().values())
+
+
+@pytest.fixture
+def cards(model, views):
+    return make_cards(bake(model, views, steps=1))
+
+
+def test_a_stage_has_the_cards_and_the_surfels(model, cards, views, tmp_path):
+    from pxr import Usd, UsdGeom, UsdShade, UsdValidation
+
+    file = tmp_path / "new" / "scene.usdz"
+    save_usdz(file, cards, model.surfels, 1, views)
+    assert [path.name for path in file.parent.iterdir()] == ["scene.usdz"]
+    stage = Usd.Stage.Open(str(file))
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert validators
+    assert not [error.GetMessage() for error in UsdValidation.ValidationContext(validators).Validate(stage)]
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and stage.GetDefaultPrim().GetPath() == "/Scene"
+
+    mesh, corners = UsdGeom.Mesh(stage.GetPrimAtPath("/Scene/Cards")), quads(cards)[0]
+    assert np.array_equal(np.array(mesh.GetPointsAttr().Get()), corners.astype(np.float32))
+    assert list(mesh.GetFaceVertexCountsAttr().Get()) == [4] * len(cards.rects)
+    world = np.array(UsdGeom.Xformable(mesh).ComputeLocalToWorldTransform(Usd.TimeCode.Default()))[:3, :3].T
+    np.testing.assert_allclose(world, upright(views), atol=1e-12)
+    box = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["default"]).ComputeUntransformedBound(mesh.GetPrim()).GetRange()
+    np.testing.assert_allclose([box.GetMin(), box.GetMax()], [corners.min(0), corners.max(0)], rtol=1e-6)
+    surface, _, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0].ComputeSurfaceSource()
+    assert abs(surface.GetInput("opacityThreshold").Get() - cards.cut.cutoff) < 1e-6
+    with zipfile.ZipFile(file) as archive:
+        pictures = [archive.read(name) for name in archive.namelist() if name.endswith(".png")]
+    assert np.array_equal(np.array(Image.open(io.BytesIO(pictures[0]))), to_uint8(cards.texels).numpy())
+
+    field, surfels = stage.GetPrimAtPath("/Scene/Surfels"), model.surfels
+    assert "ParticleFieldKernelGaussianSurfletAPI" in field.GetAppliedSchemas()
+
+    def values(name: str) -> torch.Tensor:
+        return torch.from_numpy(np.array(field.GetAttribute(name).Get()))
+
+    assert values("positions").equal(surfels.means.detach())
+    turned = field.GetAttribute("orientations").Get()
+    quats = torch.tensor([[q.GetReal(), *q.GetImaginary()] for q in turned])
+    assert_close(quats, surfels.quats, kind="value", name="orientations")
+    assert_close(values("scales")[:, :2], surfels.scales, kind="value", name="scales")
+    assert_close(values("opacities"), surfels.opacities, kind="value", name="opacities")
+    sh = values("radiance:sphericalHarmonicsCoefficients").view(len(surfels), 4, 3)
+    assert sh.equal(torch.cat([surfels.sh0, surfels.shN[:, :3]], dim=1).detach())
+
+    for shown, hidden in (("surfels", "Cards"), ("cards", "Surfels")):
+        stage.GetDefaultPrim().GetVariantSet("shown").SetVariantSelection(shown)
+        visible = {
+            name: UsdGeom.Imageable(stage.GetPrimAtPath(f"/Scene/{name}")).ComputeVisibility() == "inherited"
+            for name in ("Cards", "Surfels")
+        }
+        assert [name for name, is_visible in visible.items() if not is_visible] == [hidden]
+
+
+def test_without_cards_there_is_no_file(model, views, tmp_path):
+    with torch.no_grad():
+        model.surfels.logit_opacities.fill_(-9.0)
+    with pytest.raises(FormatError, match="expected surfels that are opaque enough"):
+        save_usdz(tmp_path / "scene.usdz", make_cards(bake(model, views, steps=1)), model.surfels, 1, views)
+    assert not list(tmp_path.iterdir())
