@@ -35,6 +35,10 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "outputs": (64,),
     "inputs": (32,),
     "rectified": (False, True),
+    "layers": (1, 4),
+    "cards": (False, True),
+    "cut": (False, True),
+    "backward": (False, True),
 }
 ALL = VALUES | {"max_hits": tuple(range(MAX_HITS + 1)), "degree": (0, 1, 2, 3), "features": (1, 2, 4, 8)}
 # Their atomics depend on the architecture.

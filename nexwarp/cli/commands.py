@@ -257,15 +257,15 @@ class Export:
         """Export."""
         self.files.check()
         opened = open_model(self.run)
-        device = pick_device(self.device)
+        device, lines = pick_device(self.device), list[str]()
         if self.files.format in RENDERED:
             with display.stages(console) as observe:
-                files = export_run(opened, self.files, device, observe)
+                files = export_run(opened, self.files, device, observe, lines.append)
         else:
             with console.status("exporting"):
                 files = export_run(opened, self.files, device)
-        for file in files:
-            console.print(str(file), soft_wrap=True)
+        for line in (*map(str, files), *lines):
+            console.print(line, soft_wrap=True, highlight=False)
 
 
 @dataclass

@@ -26,6 +26,7 @@ from nexwarp.train.report import StepReport
 
 REFRESH_SECONDS = 0.5
 LOG_LINES = 20
+LOG_SECONDS = 20.0  # between the lines of a stage
 RECENT = 30.0  # seconds after which a speed counts a third in the estimate of the time left
 
 
@@ -150,15 +151,19 @@ def loading(console: Console) -> Iterator[Callable[[int, int], None]]:
 
 @contextmanager
 def stages(console: Console, left: TimeLeft | None = None) -> Iterator[Callable[[str, int, int], None]]:
-    """Show a bar, or a line in a log file, for each stage; yield a function of its name, items done and total."""
+    """Show a bar, or lines in a log file, for each stage; yield a function of its name, items done and total."""
     tasks: dict[str, TaskID] = {}
+    shown = time.perf_counter()
     with _bars(console, TimeElapsedColumn()) as progress:
 
         def observe(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
+            nonlocal shown
+            first, due = stage not in tasks, time.perf_counter() - shown >= LOG_SECONDS
+            if first:
                 tasks[stage] = progress.add_task(stage, total=total)
-                if not console.is_terminal:
-                    console.print(f"{stage}: {total:,}", soft_wrap=True)
+            if not console.is_terminal and (first or due):
+                console.print(f"{stage}: {total:,}" if first else f"{stage}: {done:,}/{total:,}", soft_wrap=True)
+                shown = time.perf_counter()
             note = "" if left is None else f"  {left}"
             progress.update(tasks[stage], completed=done, description=f"{stage}{note}")
 

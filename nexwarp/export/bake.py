@@ -1,6 +1,6 @@
 """The neural texture baked into an image, for renderers without a hash grid and an MLP. Not in the paper.
 
-The texture is evaluated at the texels, then texels and SH are fitted to the model's own renderings.
+The texture is evaluated at the texels, then these, SH and opacities are fitted to the photos (`fit`).
 """
 
 import math
@@ -9,15 +9,16 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
-from torch.nn.functional import grid_sample, normalize
+from torch.nn.functional import grid_sample, normalize, pad
 
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
 from nexwarp.errors import FormatError
+from nexwarp.export.baked_scene import BakedScene
+from nexwarp.export.fit import Views, cameras_of, fit
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.model.model import Model
-from nexwarp.model.render import Rendering
-from nexwarp.model.surfels import Activated, Surfels
+from nexwarp.model.surfels import END, Activated, Surfels
 from nexwarp.model.texture import NeuralTexture
 
 # Hits below this blending weight do not decide where a surfel has a texture: of 255 grey levels they change 4 at most.
@@ -33,36 +34,19 @@ TEXELS_AT_A_TIME = 2**20
 LARGEST_TEXEL = 1e6  # pixels
 GROWTH = 1.2
 
-WINDOW = 256  # largest width and height that one step renders
-PASSES = 2.0  # over the views' pixels
-FEWEST_STEPS, MOST_STEPS = 70, 800
-RATES = {"atlas": 0.02, "sh0": 5e-3, "shN": 2e-3}
-LAST_RATE = 0.1  # relative to the first
-
-Progress = Callable[[str, int, int], object]  # name of a stage, how much of it is done, and of how much
+Progress = Callable[[str, int, int], None]  # name of a stage, how much of it is done, and of how much
 
 
 @dataclass(frozen=True)
 class ViewHits:
     """The heaviest hits of each pixel of one view, at most 8 a pixel; P hits in all."""
 
-    rendering: Rendering  # without texture
     slots: torch.Tensor  # (P,) int64, places in (H, W, 8) buffers; the first of a pixel has the largest weight
     ids: torch.Tensor  # (P,) int64, surfels
     weights: torch.Tensor  # (P,) blending weights
     depths: torch.Tensor  # (P,) z-depths, world units
     local: torch.Tensor  # (P, 2) coordinates of the hits on their surfels, in units of the scales
     directions: torch.Tensor  # (P, 3) unit directions of the rays, world frame
-
-    def plain_colors(self) -> torch.Tensor:
-        """Return the hits' plain colours (P, 3)."""
-        return self.rendering.intermediates.projection.records[self.ids, 3, :3]
-
-    def blended(self, colors: torch.Tensor) -> torch.Tensor:
-        """Return the sums (H, W, 3) over each pixel's hits of weight * colors (P, 3); differentiable."""
-        height, width = self.rendering.alpha.shape
-        sums = colors.new_zeros(height * width, 3)
-        return sums.index_add(0, self.slots // MAX_HITS, self.weights[:, None] * colors).view(height, width, 3)
 
 
 @dataclass(frozen=True)
@@ -127,26 +111,46 @@ class Baked:
         """Return what the atlas adds (..., 3) to the colours of surfels (...) at coordinates (..., 2) on them."""
         return sample(self.atlas, self.layout.texels(ids, local))
 
+    def scene(self) -> BakedScene:
+        """Return the scene that a page draws of it, at the mean exposure."""
+        options, surfels, rects = self.model.options, self.surfels, self.layout.rects.float()
+        used = (options.sh_degree + 1) ** 2 - 1
+        return BakedScene(
+            Activated(*(x.detach() for x in surfels.activated())),
+            pad(self.atlas, (0, 1)),
+            self.layout.boxes,
+            torch.cat([rects[:, :2], rects[:, 2:] - 1], dim=1),
+            (surfels.sh0.detach(), surfels.shN.detach()[:, :used]),
+            self.model.detail_limits if options.detail_limits else None,
+            background=options.background,
+        )
+
     def mean_colors(self) -> torch.Tensor:
         """Return the plain colours (N, 3) of the surfels from the mean directions that the views see them in."""
         surfels, degree = self.surfels, self.model.options.sh_degree
         return ops.plain_colors((surfels.sh0, surfels.shN), self.seen.directions, surfels.means.new_zeros(3), degree)
 
 
-def bake(
-    model: Model, cameras: Sequence[Camera], *, steps: int | None = None, progress: Progress = lambda *_: None
-) -> Baked:
+def bake(model: Model, views: Views, *, steps: int | None = None, progress: Progress = lambda *_: None) -> Baked:
     """Bake a model's texture into an atlas whose texels are about a pixel of the closest of the given views.
 
-    The number of steps of the fit follows from that of the views' pixels unless it is given. `progress` is called with
-    each stage's name, how many views or steps of it are done, and of how many.
+    It is fitted to the photos of the views, or for cameras to the model's renderings; see `fit`. `progress` is called
+    with each stage's name, how many views or steps of it are done, and of how many.
     """
-    if steps is None:
-        windows = sum(camera.width * camera.height for camera in cameras) / WINDOW**2
-        steps = min(max(round(PASSES * windows), FEWEST_STEPS), MOST_STEPS)
-    seen = observe(model, cameras, partial(progress, "measuring surfels"))
-    baked = evaluate(model, seen, lay_out(seen.boxes, seen.pixels))
-    return fit(baked, cameras, steps, partial(progress, "baking the texture"))
+    baked = measure(model, views, progress)
+    scene = fit(baked.scene(), model, views, steps, partial(progress, "baking the texture"))
+    assert scene.harmonics is not None
+    sh0, shN = scene.harmonics
+    state = {name: x.detach().clone() for name, x in baked.surfels.state_dict().items()}
+    state |= {"sh0": sh0, "logit_opacities": torch.logit(scene.shape.opacities, END)}
+    state["shN"][:, : shN.shape[1]] = shN
+    return replace(baked, surfels=Surfels(state), atlas=scene.texels[..., :3])
+
+
+def measure(model: Model, views: Views, progress: Progress = lambda *_: None) -> Baked:
+    """Return the first atlas, of the texture itself, before any fit."""
+    seen = observe(model, cameras_of(views), partial(progress, "measuring surfels"))
+    return evaluate(model, seen, lay_out(seen.boxes, seen.pixels))
 
 
 def axes(surfels: Surfels | Activated) -> tuple[torch.Tensor, torch.Tensor]:
@@ -185,7 +189,7 @@ def hits_of(bare: Model, camera: Camera) -> ViewHits:
     offsets = camera.position.to(weights) + depths[:, None] * rays - surfels.means.detach()[ids]
     coordinates = [(offsets * axis[ids]).sum(1) for axis in axes(surfels)]
     local = torch.stack(coordinates, dim=1) / surfels.scales.detach()[ids]
-    return ViewHits(rendering, slots, ids, weights, depths, local, normalize(rays, dim=1))
+    return ViewHits(slots, ids, weights, depths, local, normalize(rays, dim=1))
 
 
 @torch.no_grad()
@@ -299,44 +303,3 @@ def evaluate(model: Model, seen: Observations, layout: Layout) -> Baked:
         colors = colors_at(points[:, None], sizes[ids, None], seen.directions[ids])[:, 0]
         atlas[places[:, 1], places[:, 0]] = seen.textured[ids, None] * (colors - plain[ids])
     return baked
-
-
-def fit(
-    baked: Baked, cameras: Sequence[Camera], steps: int, progress: Callable[[int, int], object] = lambda *_: None
-) -> Baked:
-    """Fit atlas and SH to the model's renderings by least squares: Adam, a window of one view a step."""
-    model, degree = baked.model, baked.model.options.sh_degree
-    state = {name: x.detach().clone() for name, x in baked.surfels.state_dict().items()}
-    trained = {"atlas": baked.atlas.clone(), "sh0": state["sh0"], "shN": state["shN"]}
-    groups = [{"params": [x.requires_grad_()], "lr": RATES[name]} for name, x in trained.items()]
-    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, LAST_RATE ** (1 / max(steps, 1)))
-    bare = untextured(model)
-    order = torch.Generator().manual_seed(0)
-    views: list[int] = []
-    for done in range(1, steps + 1):
-        views = views or torch.randperm(len(cameras), generator=order).tolist()
-        camera = _window(cameras[views.pop()].to(model.device), order)
-        target = model.render_image(camera, exposure="mean")
-        hits = hits_of(bare, camera)
-        plain = ops.plain_colors((trained["sh0"], trained["shN"]), state["means"], camera.position.to(target), degree)
-        added = sample(trained["atlas"], baked.layout.texels(hits.ids, hits.local))
-        colors = (plain.index_select(0, hits.ids) + added).clamp_min(0)
-        with torch.no_grad():  # further hits in their plain colours, and the background
-            others = hits.rendering.image - hits.blended(hits.plain_colors())
-        loss = (others + hits.blended(colors) - target).square().mean()
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        progress(done, steps)
-    state |= {name: trained[name].detach() for name in ("sh0", "shN")}
-    return replace(baked, surfels=Surfels(state), atlas=trained["atlas"].detach())
-
-
-def _window(camera: Camera, generator: torch.Generator) -> Camera:
-    """Return the camera of a random window of an image."""
-    width, height = min(camera.width, WINDOW), min(camera.height, WINDOW)
-    left = int(torch.randint(camera.width - width + 1, (1,), generator=generator))
-    top = int(torch.randint(camera.height - height + 1, (1,), generator=generator))
-    return camera.crop(left, top, width, height)

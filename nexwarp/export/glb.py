@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,13 @@ import torch
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import up_direction
 from nexwarp.errors import FormatError
-from nexwarp.export.bake import Baked, lay_out, points_on
+from nexwarp.export.bake import Baked, Progress, lay_out, measure, points_on
 from nexwarp.export.baked_scene import BakedScene, Header, card_scene
+from nexwarp.export.fit import Views, fit
 from nexwarp.io.files import write_atomically
 from nexwarp.io.pictures import to_uint8
 from nexwarp.kernels.types import ALPHA_MAX
+from nexwarp.model.model import Model
 from nexwarp.ops.atlas import Cut
 
 ALPHAS = ("mask", "blend")
@@ -23,6 +26,16 @@ CUTOFF = 0.3
 # The quads end where alpha falls to this: bilinear sampling needs what lies beyond the cut-off.
 LEAST_ALPHA = {"mask": 0.5, "blend": 0.05}  # of the cut-off
 FEWEST = 8  # texels along an axis: alpha varies over every quad
+
+
+def bake_cards(
+    model: Model, views: Views, alpha: str = "mask", *, steps: int | None = None, progress: Progress = lambda *_: None
+) -> BakedScene:
+    """Bake a model into cards, fitted to the views' photos, or for cameras to the model's renderings; see `bake`."""
+    cards = make_cards(measure(model, views, progress), alpha)
+    if not len(cards.shape.means):
+        return cards
+    return fit(cards, model, views, steps, partial(progress, "baking the texture"))
 
 
 @torch.no_grad()

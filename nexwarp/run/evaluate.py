@@ -90,7 +90,7 @@ def evaluate(
         for view, (picture, values) in zip(group, _gathered(mine, group, ranks), strict=True):
             results[view.name] = values
             if renders is not None and ranks.first:
-                photo, mask = _compared(model, view, mask_mode)
+                photo, mask = compared(model, view, mask_mode)
                 captions = ["photo", f"render {psnr(picture, photo, mask):.2f} dB", "error (0 to 0.25)"]
                 strip = side_by_side([photo, picture, error_map(picture, photo)], captions=captions)
                 save_png(renders / TEST / picture_name(view.name), picture)
@@ -107,11 +107,11 @@ def evaluate(
 def _judge(model: Model, view: View, mask_mode: str, metrics: Sequence[str]) -> tuple[torch.Tensor, Values]:
     """Render a view; return the picture, (H, W, 3) uint8 on the CPU, and its metrics."""
     picture = to_uint8(model.render_image(view.camera)).cpu()
-    photo, mask = _compared(model, view, mask_mode)
+    photo, mask = compared(model, view, mask_mode)
     return picture, {name: METRICS[name](picture, photo, mask) for name in metrics}
 
 
-def _compared(model: Model, view: View, mask_mode: str) -> tuple[torch.Tensor, torch.Tensor | None]:
+def compared(model: Model, view: View, mask_mode: str) -> tuple[torch.Tensor, torch.Tensor | None]:
     """Return the photo that a rendering is compared with, (H, W, 3) uint8, and the mask of what counts."""
     photo = to_uint8(view.image)
     if view.mask is None or mask_mode != "background":

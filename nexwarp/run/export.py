@@ -2,9 +2,10 @@
 
 import importlib.util
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated
 
 import torch
@@ -13,12 +14,15 @@ from tyro.conf import arg
 from nexwarp.cameras.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
+from nexwarp.data import View
 from nexwarp.data.images import image_size
 from nexwarp.data.scene import DEMO, SceneSource, demo_folder
 from nexwarp.data.transforms import lens_keys
 from nexwarp.errors import RunError, SettingError
-from nexwarp.export.bake import Progress, bake
-from nexwarp.export.glb import ALPHAS, make_cards, save_glb
+from nexwarp.export.bake import Progress
+from nexwarp.export.baked_scene import GLB, load_baked
+from nexwarp.export.fit import Views
+from nexwarp.export.glb import ALPHAS, bake_cards, save_glb
 from nexwarp.export.mesh import extract_mesh, save_mesh
 from nexwarp.export.splats import (
     MAX_EXTENT,
@@ -33,12 +37,16 @@ from nexwarp.io.files import one_line
 from nexwarp.io.json_files import JsonObject, write_json
 from nexwarp.model.compact import NOISE, NOISES
 from nexwarp.model.model_file import save_model
+from nexwarp.run.evaluate import compared, psnr
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
+from nexwarp.train.recipe import MASK_MODES
 
 # Packages that formats need, and their extras.
 PACKAGES = {"glb": ("trimesh", "glb"), "spz": ("gaussforge", "splats"), "usd": ("pxr", "usd")}
 SPLAT_WRITERS = {"ply": save_splats_ply, "spz": save_splats_spz, "gltf-splats": save_splats_glb}
 RENDERED = ("mesh", "web", "glb", "usd")  # formats that are made of renderings, stage by stage
+BAKED = ("web", "glb", "usd")  # formats whose texture is baked, and fitted to photos
+READ = ("web", "glb")  # of these, those that can be read back
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows
 
 
@@ -54,6 +62,8 @@ class ExportOrder:
     """Of --format web: quantised files are a fifth to a half as large."""
     alpha: Annotated[str, arg(metavar="{mask,blend}")] = "mask"
     """Of glb, usd: mask cuts surfels out, which all programs draw; blend is closer to photos, in those that sort."""
+    finetune: Annotated[bool, arg(help_behavior_hint="(default: to the training photos, where they are)")] = True
+    """Fit what is baked to the model's renderings alone."""
     noise: Annotated[float | None, arg(metavar="X", help_behavior_hint="(default: 8 % of the test views' error)")] = (
         None
     )
@@ -86,16 +96,25 @@ class ExportOrder:
 
 
 def export_run(
-    opened: OpenedModel, order: ExportOrder, device: torch.device | str = "cpu", observe: Progress = lambda *_: None
+    opened: OpenedModel,
+    order: ExportOrder,
+    device: torch.device | str = "cpu",
+    observe: Progress = lambda *_: None,
+    report: Callable[[str], object] = lambda _: None,
 ) -> Sequence[Path]:
     """Export a run or a model, and return the files that were written; docs/outputs.md describes them.
 
     `device` renders what a mesh or a baked texture is made of; `observe` is called with the name of each of their
-    stages, how many views, blocks or steps of it are done, and of how many.
+    stages, how many views, blocks or steps of it are done, and of how many; `report` with a line that tells how close
+    a baked file comes to the test photos.
     """
     order.check()
     folder = order.out or opened.folder / EXPORT_FOLDER
-    files = [*_export(opened, order, folder, device, observe)]
+    baked = order.format in BAKED
+    train, test = _photos(opened, observe) if baked and order.finetune and opened.source is not None else ([], [])
+    files = [*_export(opened, order, folder, train, device, observe)]
+    if test and order.format in READ:
+        report(_quality(opened, files, test, device))
     # Compact models and cameras say themselves where their frame lies in the world.
     if order.format not in ("compact", "cameras") and any(opened.model.origin or ()):
         files.append((folder.parent if folder.suffix == ".html" else folder) / ORIGIN_FILE)
@@ -105,7 +124,12 @@ def export_run(
 
 
 def _export(
-    opened: OpenedModel, order: ExportOrder, folder: Path, device: torch.device | str, observe: Progress
+    opened: OpenedModel,
+    order: ExportOrder,
+    folder: Path,
+    photos: Sequence[View],
+    device: torch.device | str,
+    observe: Progress,
 ) -> Sequence[Path]:
     """Write the files of a format."""
     files = [folder / name for name in EXPORTS[order.format]]
@@ -113,11 +137,13 @@ def _export(
     # A training that stopped early leaves no cameras file.
     if order.format not in ("compact", "mesh", "cameras") and (opened.folder / CAMERAS_FILE).is_file():
         views = {name: camera for members in opened.cameras.values() for name, camera in members.items()}
+    # What is baked learns from no test view, not even from its pose.
+    seen: Views = photos or ([*opened.cameras.get(TRAIN, {}).values()] if views else [])
     if order.format == "web":
         from nexwarp.export.web.export import export_web
 
-        model, page = opened.model.to(device), order.out or files[0]
-        return export_web(model, views, page, quality=order.quality, title=opened.title or "nexwarp", progress=observe)
+        model, page, title = opened.model.to(device), order.out or files[0], opened.title or "nexwarp"
+        return export_web(model, views, page, seen, quality=order.quality, title=title, progress=observe)
     if order.format == "cameras":
         _export_cameras(opened, *files)
     elif order.format == "mesh":
@@ -129,7 +155,7 @@ def _export(
     elif order.format == "compact":
         save_model(files[0], opened.model, compact=_noise(opened) if order.noise is None else order.noise)
     else:
-        _export_geometry(opened, order, files, list(views.values()), device, observe)
+        _export_geometry(opened, order, files, list(views.values()), seen, device, observe)
     return files
 
 
@@ -138,6 +164,7 @@ def _export_geometry(
     order: ExportOrder,
     files: Sequence[Path],
     cameras: list[Camera],
+    seen: Views,
     device: torch.device | str,
     observe: Progress,
 ) -> None:
@@ -146,7 +173,7 @@ def _export_geometry(
     if order.format in ("glb", "usd"):
         if not cameras:
             raise RunError(f"{opened.path}: --format {order.format}: expected the run's {CAMERAS_FILE}, found none")
-        cards = make_cards(bake(opened.model.to(device), cameras, progress=observe), order.alpha)
+        cards = bake_cards(opened.model.to(device), seen or cameras, order.alpha, progress=observe)
         if order.format == "glb":
             save_glb(files[0], cards, cameras)
         else:
@@ -155,6 +182,44 @@ def _export_geometry(
     if order.format == "ply":
         save_surfels_ply(files[0], surfels)
     SPLAT_WRITERS[order.format](files[-1], surfels, degree, cameras=cameras, max_extent=order.max_extent)
+
+
+def _photos(opened: OpenedModel, observe: Progress) -> tuple[list[View], list[View]]:
+    """Read the training photos, with the run's poses, and the test photos of a run; none where that is impossible."""
+    assert opened.source is not None
+    try:
+        scene = opened.source.load(lambda done, total: observe("reading photos", done, total))
+    except (OSError, ValueError, MemoryError) as error:
+        warnings.warn(f"the photos cannot be read ({one_line(error)}), so nothing is fitted to them", stacklevel=2)
+        return [], []
+    mode = MASK_MODES[0] if opened.config is None else opened.config.mask_mode
+    groups = []
+    for views in (scene.train, scene.test):
+        shown = [(view, *compared(opened.model, view, mode)) for view in views]
+        groups.append([replace(view, image=image, mask=mask) for view, image, mask in shown])
+    cameras = opened.cameras.get(TRAIN, {}) if (opened.folder / CAMERAS_FILE).is_file() else {}
+    return [replace(view, camera=cameras.get(view.name, view.camera)) for view in groups[0]], groups[1]
+
+
+@torch.no_grad()
+def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], device: torch.device | str) -> str:
+    """Return a line with the PSNR of a baked file and of the model on test views, and the file's size."""
+    model = opened.model.to(device)
+    file = next(file for file in files if file.suffix in (".html", GLB))
+    scene, exposures = load_baked(file).to(device), None
+    if scene.exposures is None and model.options.exposure == "photos":
+        exposures = model.exposures
+
+    def shown(camera: Camera) -> torch.Tensor:
+        image = scene.render(camera, background=model.options.background)
+        return image if exposures is None else image * exposures.factors(camera)
+
+    baked, neural = (
+        fmean(psnr(render(view.camera.to(device)), view.image, view.mask) for view in views)
+        for render in (shown, model.render_image)
+    )
+    size = sum(path.stat().st_size for path in files) / 1e6
+    return f"test PSNR: {baked:.2f} dB baked, {neural:.2f} dB neural, {len(views)} views; {size:.1f} MB"
 
 
 def _noise(opened: OpenedModel) -> float:

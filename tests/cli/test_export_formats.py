@@ -1,18 +1,25 @@
 """`nexwarp export`: the web page, glTF and SPZ of a finished run."""
 
+import dataclasses
+import re
+import shutil
+from pathlib import Path
+
 import pytest
+from PIL import Image, ImageOps
 
 from nexwarp.cli import main as cli
 from nexwarp.export.web import baked
 from nexwarp.run.export import ExportOrder, export_run
-from nexwarp.run.folder import open_model
+from nexwarp.run.folder import open_model, read_metrics
 from tests.cli.support import refused
+from tests.narrowing import present
 
 
 @pytest.fixture(autouse=True)
 def few_steps(small_preset, monkeypatch):
     """Bake quickly."""
-    monkeypatch.setattr("nexwarp.export.bake.FEWEST_STEPS", 2)
+    monkeypatch.setattr("nexwarp.export.fit.FEWEST_STEPS", 2)
 
 
 def test_a_finished_run_becomes_a_web_page(finished, capsys):
@@ -48,7 +55,7 @@ def test_a_finished_run_becomes_gltf_usd_and_spz(finished, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("kind", "stages"),
     [
-        ("web", {"measuring surfels": 10, "baking the texture": 2}),
+        ("web", {"reading photos": 10, "measuring surfels": 8, "baking the texture": 2}),
         ("mesh", {"choosing the voxel": 8, "finding surfaces": 8, "fusing depths": 8}),
     ],
 )
@@ -71,3 +78,36 @@ def test_exports_tell_their_stages(kind, stages, finished, capsys):
 def test_a_run_without_cameras_has_no_gltf(finished, capsys):
     (finished / "cameras.json").unlink()
     refused(capsys, ["export", str(finished), "--format", "glb", "--device", "cpu"], "cameras.json", "--format glb")
+
+
+def baked_files(run: Path, path: str | None = None, finetune: bool = True) -> tuple[list[bytes], list[str]]:
+    """The files of a run's baked page, whose scene may have moved, and what their export reported."""
+    lines: list[str] = []
+    opened = open_model(run)
+    source = present(opened.source)
+    source = dataclasses.replace(source, path=path or source.path)
+    order = ExportOrder("web", run / "page", finetune=finetune)
+    export_run(dataclasses.replace(opened, source=source), order, report=lines.append)
+    return [(run / "page" / name).read_bytes() for name in (baked.BAKED_FILE, baked.ATLAS_FILE)], lines
+
+
+def test_an_export_learns_from_training_photos_alone(finished, tmp_path):
+    """And tells the PSNR of what was written on the test photos."""
+    source = present(open_model(finished).source)
+    results = {"as it is": baked_files(finished)}
+    for group in ("test", "train"):
+        scene = shutil.copytree(source.path, tmp_path / group)
+        for name in open_model(finished).cameras[group]:
+            file = scene / source.images / name
+            with Image.open(file) as photo:
+                ImageOps.invert(photo.convert("RGB")).save(file)
+        results[group] = baked_files(finished, path=str(scene))
+    files, (line,) = results["as it is"]
+    assert results["test"][0] == files and results["test"][1] != [line]
+    assert results["train"][0] != files
+    psnr = read_metrics(finished)["psnr"]
+    assert re.fullmatch(rf"test PSNR: [\d.]+ dB baked, {psnr:.2f} dB neural, 2 views; [\d.]+ MB", line)
+    without, lines = baked_files(finished, finetune=False)
+    assert without != files and not lines
+    with pytest.warns(UserWarning, match="the photos cannot be read .* nothing is fitted to them"):
+        assert baked_files(finished, path=str(tmp_path / "gone")) == (without, [])

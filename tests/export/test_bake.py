@@ -78,15 +78,16 @@ def test_the_first_atlas_has_the_colors_of_the_texture(residual, cameras):
 
 
 def test_images_are_those_of_the_definition_and_the_fit_approaches_the_model(baked, model, cameras):
+    gains = []
     for camera in cameras.values():
-        # Hits beyond the eighth, and those below a thousandth, have their plain colours.
-        assert psnr(rendered(baked, camera), support.composited(copy.deepcopy(baked), camera)) > 50
+        assert psnr(rendered(baked, camera), support.composited(copy.deepcopy(baked), camera)) > 80
         expected = model.render(camera).image.detach()
-        first = rendered(evaluate(model, baked.seen, baked.layout), camera)
-        plain = model.bare(max_hits=0).render(camera).image.detach()
+        first = psnr(rendered(evaluate(model, baked.seen, baked.layout), camera), expected)
+        plain = psnr(model.bare(max_hits=0).render(camera).image.detach(), expected)
         fitted = psnr(rendered(as_stored(baked), camera), expected)
-        assert fitted > psnr(first, expected) + 1, "the fit helps"
-        assert fitted > psnr(plain, expected) + 6 and fitted > 24
+        assert fitted > plain + 6 and fitted > 24
+        gains.append(fitted - first)
+    assert sum(gains) > len(gains), "the fit helps by 1 dB"
 
 
 def test_codes_are_near_the_values(baked):

@@ -51,8 +51,7 @@ def baked(model, cameras):
 @pytest.fixture(scope="module")
 def files(model, cameras) -> dict[str, bytes]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nexwarp.export.bake.FEWEST_STEPS", 10)
-        patch.setattr("nexwarp.export.bake.MOST_STEPS", 10)
+        patch.setattr("nexwarp.export.fit.FEWEST_STEPS", 10)
         return page_files(model, cameras)
 
 

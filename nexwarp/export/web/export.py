@@ -13,6 +13,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera, resized
 from nexwarp.export.bake import Progress, bake
+from nexwarp.export.fit import Views
 from nexwarp.export.web.baked import encode_baked
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
 from nexwarp.io.files import write_together
@@ -30,6 +31,7 @@ def export_web(
     model: Model,
     cameras: Mapping[str, Camera],
     out: Path,
+    views: Views = (),
     *,
     quality: str = "quantised",
     title: str = "nexwarp",
@@ -38,9 +40,10 @@ def export_web(
     """Write the page of a scene, and return its files; it starts at the first of the cameras by name.
 
     `out` is a file name that ends in .html, or a folder; `quality` of the scene file is "quantised" or "full";
-    `progress` is that of `nexwarp.export.bake.bake`.
+    `views`, by default
+    the cameras, and `progress` are those of `nexwarp.export.bake.bake`.
     """
-    content = page_files(model, cameras, quality=quality, title=title, progress=progress)
+    content = page_files(model, cameras, views, quality=quality, title=title, progress=progress)
     if out.suffix == ".html":
         content = {out.name: one_file(content)}
         out = out.parent
@@ -52,6 +55,7 @@ def export_web(
 def page_files(
     model: Model,
     cameras: Mapping[str, Camera],
+    views: Views = (),
     *,
     quality: str = "quantised",
     title: str = "nexwarp",
@@ -63,7 +67,7 @@ def page_files(
     poster = _poster(model, next(iter(cameras.values()))) if cameras else None
     content[SCENE_FILE] = encode_scene(model, cameras, quality=quality, title=title, poster=poster)
     if cameras and len(model.surfels):
-        content |= encode_baked(bake(model, list(cameras.values()), progress=progress), cameras)
+        content |= encode_baked(bake(model, views or list(cameras.values()), progress=progress), cameras)
     return content
 
 

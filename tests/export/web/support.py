@@ -19,7 +19,7 @@ from scipy.ndimage import map_coordinates
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.export.bake import Baked, hits_of, untextured
+from nexwarp.export.bake import Baked
 from nexwarp.export.web.baked import encode_harmonics, encode_picture
 from nexwarp.export.web.quantise import CHUNK
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
@@ -119,10 +119,8 @@ def ring(count: int = 4, width: int = 64, height: int = 48) -> dict[str, nw.Came
 
 @torch.no_grad()
 def rendered(baked: Baked, camera: nw.Camera) -> torch.Tensor:
-    """The image (H, W, 3) of a camera at the mean exposure, without texels of hits beyond a pixel's 8 heaviest."""
-    hits = hits_of(untextured(baked.model, baked.surfels), camera)
-    added = torch.maximum(baked.added(hits.ids, hits.local), -hits.plain_colors())
-    return hits.rendering.image + hits.blended(added)
+    """The image (H, W, 3) of a camera at the mean exposure."""
+    return baked.scene().render(camera)
 
 
 def bilinear(atlas: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
