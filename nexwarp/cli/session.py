@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 from rich.console import Console
@@ -21,11 +21,13 @@ from nexwarp.io.json_files import Json, write_json
 from nexwarp.machine import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, load, save_model
-from nexwarp.run.evaluate import evaluate
+from nexwarp.run.evaluate import Values, evaluate
 from nexwarp.run.folder import (
     COMPARE,
     METRICS_FILE,
+    PHOTOS_FILE,
     RENDERS_FOLDER,
+    TEST,
     TRAIN,
     RunRecord,
     create_run,
@@ -37,10 +39,12 @@ from nexwarp.run.folder import (
     teacher_folder,
 )
 from nexwarp.run.log import TrainingLog
+from nexwarp.run.photo_table import save_photo_table
 from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.report import StepReport
 from nexwarp.train.stages import VIEW_COST, Stage, StageStore, divide
+from nexwarp.train.target import with_cameras
 from nexwarp.train.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -101,7 +105,7 @@ class Session(StageStore):
             photos, tests = len(trainer.scene.train), trainer.scene.test
             coming = [s for s in divide(self.record.config, self.record.own) if s.before >= stage.before]
             pixels = sum(view.camera.width * view.camera.height for view in tests)
-            work = sum(s.work(photos) for s in coming) + VIEW_COST * len(tests)
+            work = sum(s.work(photos) for s in coming) + VIEW_COST * (photos + len(tests))
             self.left = display.TimeLeft(work - trainer.iteration, JUDGED * pixels)
         self.begun = True
 
@@ -234,12 +238,16 @@ class Session(StageStore):
         return model
 
     def _evaluate(self, trainer: Trainer, model: Model, facts: dict[str, Json]) -> None:
-        """Evaluate the run's model on the test views, if there are any, and print the figures."""
+        """Evaluate the run's model on the test views, if there are any, and on the photos; print the figures."""
         views = trainer.scene.test
         rows = {}
+        judged = self._judged_photos(trainer, model)
         if views:
             options = {"mask_mode": trainer.config.mask_mode, "ranks": self.ranks}
-            rows = figures(evaluate_run(model, views, self.run, self.console, facts, **options))
+            entries = evaluate_run(model, views, self.run, self.console, facts, **options)
+            rows = figures(entries)
+            judged |= cast(dict[str, Values], entries["views"])
+        save_photo_table(self.run / PHOTOS_FILE, {TRAIN: trainer.scene.train, TEST: views}, judged)
         rows |= {
             "surfels": f"{len(model.surfels):,}",
             "model file": f"{facts['megabytes']:.1f} MB",
@@ -256,9 +264,19 @@ class Session(StageStore):
         if trainer.graphs is not None:
             trainer.graphs.clear()  # NCCL waits, when it ends, for graphs that hold its all-reduce
         model = shared_model(None, self.ranks)
+        if not stage.teacher:
+            self._judged_photos(trainer, model)
         if trainer.scene.test and not stage.teacher:
             evaluate(model, trainer.scene.test, mask_mode=trainer.config.mask_mode, ranks=self.ranks)
         return model
+
+    @torch.no_grad()
+    def _judged_photos(self, trainer: Trainer, model: Model) -> dict[str, Values]:
+        """Return the PSNR of the training photos; all ranks render a share."""
+        views = with_cameras(trainer.scene.train, trainer.views.refined_cameras(trainer.poses))
+        with display.counting(self.console, "judging photos", len(views)) as done:
+            mode, ranks = trainer.config.mask_mode, self.ranks
+            return evaluate(model, views, mask_mode=mode, metrics=("psnr",), progress=done, ranks=ranks)["views"]
 
 
 @contextmanager

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
@@ -17,7 +18,17 @@ import torch
 from tyro.conf import Positional, arg
 
 from nexwarp.cameras.camera import Array, Camera
-from nexwarp.data.capture import Capture, Cloud, Photo, report_missing, report_unused, safe_name, scene_errors
+from nexwarp.data.capture import (
+    Capture,
+    Cloud,
+    Photo,
+    plain_name,
+    report_missing,
+    report_unused,
+    safe_name,
+    scene_errors,
+    short,
+)
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.images import quiet_pillow
 from nexwarp.data.in_memory import as_bytes, make_cloud, near_origin, split_views
@@ -85,6 +96,8 @@ class SceneSource:
     """Follow symbolic links out of SCENE."""
     skip_missing: Annotated[bool, arg(help_behavior_hint="")] = False
     """Go on without photos that do not exist."""
+    exclude: Annotated[tuple[str, ...], arg(metavar="NAME ...", help_behavior_hint="")] = ()
+    """Leave photos out, by name or pattern (*.png)."""
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "SceneSource":
@@ -94,7 +107,10 @@ class SceneSource:
             TypeError, ValueError: naming a field of another type.
         """
         known = {field.name for field in dataclasses.fields(cls)}
-        source = cls(**{name: value for name, value in data.items() if name in known})
+        values = {name: value for name, value in data.items() if name in known}
+        if isinstance(exclude := values.get("exclude"), list):  # of JSON
+            values["exclude"] = tuple(exclude)
+        source = cls(**values)
         if "downscale" not in data:  # of the first version, as all runs have it
             raise ValueError("scene: expected the key downscale, found none")
         _check_types(source)
@@ -278,6 +294,7 @@ def load_scene(
             one half and more counts. None or "none": no masks. `background`: "white", "black", three numbers in
             [0, 1] or "random", which puts photos on white and marks the scene for training on random colours.
             `points`: in the scene's world frame. `follow_links`: a scene of others can then show any picture.
+            `exclude`: names or patterns ("left/*") of photos to leave out; the others stay training or test views.
 
     Returns:
         The scene, all tensors on the CPU.
@@ -288,7 +305,7 @@ def load_scene(
         TypeError, ValueError: an argument of the wrong type or out of range.
         SceneError: no such `format`, more than one kind of scene, damaged or malformed files, cameras that are not
             usable, a photo or mask whose shape is not its camera's, names that leave the folder, fewer than 2 photos,
-            a COLMAP model without points, photos too many for the memory.
+            a COLMAP model without points, photos too many for the memory, an `exclude` that names no photo.
     """
     source = SceneSource(path, images, downscale, **options)  # type: ignore[arg-type]  # checked below
     _check_types(source)
@@ -307,11 +324,15 @@ def _check_types(source: SceneSource) -> None:
         "follow_links": ((bool,), "True or False"),
         "skip_missing": ((bool,), "True or False"),
         "downscale": ((int,), "an int"),
+        "exclude": ((tuple, list), "a list of names"),
     }
     for name, (kind, expected) in kinds.items():
         value = getattr(source, name)
         if not isinstance(value, kind) or (isinstance(value, bool) and bool not in kind):
             raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}")
+    for name in source.exclude:
+        if not isinstance(name, str):
+            raise TypeError(f"exclude: expected names of photos, got {type(name).__name__}")
 
 
 def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | None) -> Scene:
@@ -331,10 +352,8 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | No
         cloud = capture.cloud
         if source.points is not None:
             cloud = _given_points(Path(source.points), capture)
-        tests = [
-            index % TEST_EVERY == 0 if capture.test is None else photo.name in capture.test
-            for index, photo in enumerate(capture.photos)
-        ]
+        assert capture.test is not None
+        tests = [photo.name in capture.test for photo in capture.photos]
         viewmats = [photo.viewmat for photo, test in zip(capture.photos, tests, strict=True) if not test]
         scale = _scene_scale(str(capture.source), viewmats, cloud)
         background = capture.background if color is None else color
@@ -453,6 +472,30 @@ def _given_points(file: Path, capture: Capture) -> Cloud:
 
 
 def _read_capture(source: SceneSource, path: Path) -> Capture:
+    """Read a capture without the photos to exclude; `test` names the test photos, which do not depend on those."""
+    capture = _read_files(source, path)
+    test = frozenset(photo.name for photo in capture.photos[::TEST_EVERY]) if capture.test is None else capture.test
+    excluded: set[str] = set()
+    for pattern in source.exclude:
+        matched = _matching([photo.name for photo in capture.photos], pattern)
+        if capture.photos and not matched:
+            example = capture.photos[0].name
+            raise ValueError(f"exclude: no photo of {capture.source} is named {short(pattern)}, as {example} is")
+        excluded |= matched
+    photos = [photo for photo in capture.photos if photo.name not in excluded]
+    if excluded and all(photo.name in test for photo in photos):
+        raise ValueError(f"exclude: expected to leave a training photo of {capture.source}, got none")
+    return dataclasses.replace(capture, photos=photos, test=test)
+
+
+def _matching(names: Sequence[str], pattern: str) -> set[str]:
+    """Return the names that equal a pattern, else those that it matches, in any Unicode form."""
+    plain, pattern = {name: plain_name(name) for name in names}, plain_name(pattern)
+    equal = {name for name in names if plain[name] == pattern}
+    return equal or {name for name in names if fnmatchcase(plain[name], pattern)}
+
+
+def _read_files(source: SceneSource, path: Path) -> Capture:
     kind = find_format(path, source.format)
     if kind == "colmap":
         capture = read_model(path, path / source.images, source.follow_links, source.points is None)

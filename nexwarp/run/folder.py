@@ -37,11 +37,13 @@ from nexwarp.train.stages import NO_TEACHERS, OwnTeachers
 CONFIG_FILE = "config.json"
 METRICS_FILE = "metrics.json"
 LOG_FILE = "metrics.jsonl"
+PHOTOS_FILE = "photos.csv"
 DIVERGED_FILE = "diverged.json"  # of versions up to 0.2
 LOCK_FILE = "run.lock"
 WANDB_FILE = "wandb.json"  # of versions up to 0.2
 CAMERA_PATH = "camera_path_{}.json"
-ROOT_FILES = (CONFIG_FILE, MODEL_FILE, CAMERAS_FILE, METRICS_FILE, LOG_FILE, DIVERGED_FILE, LOCK_FILE, WANDB_FILE)
+RESULTS = (MODEL_FILE, CAMERAS_FILE, METRICS_FILE, PHOTOS_FILE)
+ROOT_FILES = (CONFIG_FILE, *RESULTS, LOG_FILE, DIVERGED_FILE, LOCK_FILE, WANDB_FILE)
 
 TEACHERS_FOLDER = "teachers"
 TENSORBOARD_FOLDER = "tensorboard"

@@ -25,6 +25,7 @@ RUN_FILES = {
     "cameras.json",
     "metrics.json",
     "metrics.jsonl",
+    "photos.csv",
     "renders",
     "checkpoint",
 }

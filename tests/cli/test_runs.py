@@ -1,5 +1,6 @@
 """The command line from a scene to a finished run: train, eval, render and info."""
 
+import csv
 import json
 import shutil
 from pathlib import Path
@@ -8,23 +9,27 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
 import nexwarp as nw
+from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
+from nexwarp.data import View
 from nexwarp.io.pictures import CAPTION_HEIGHT, to_uint8
 from nexwarp.run.evaluate import CONVENTION, psnr
 from nexwarp.run.folder import list_files
+from nexwarp.run.photo_table import save_photo_table
 from nexwarp.train.recipe import config_from_dict
 from nexwarp.train.trainer import Trainer
-from tests.cli.support import FLAGS, RUN_FILES, SMALL, picture, read, snapshot
+from tests.cli.support import FLAGS, RUN_FILES, SMALL, picture, read, refused, snapshot
 from tests.data.test_scene import make_scene
 from tests.scene_writers import write_blender, write_points
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 
 
-LINKS = {"follow_links": False, "skip_missing": False}
+LINKS = {"follow_links": False, "skip_missing": False, "exclude": []}
 
 
 def test_a_run_holds_what_it_should(trained, scene):
@@ -105,6 +110,56 @@ def test_eval_reproduces_the_metrics(finished, capsys):
     assert now == {key: before[key] for key in ("psnr", "ssim", "views", "convention")}
     assert snapshot(finished / "renders") == renders
     assert f"{before['psnr']:.2f} dB" in capsys.readouterr().out
+
+
+def test_the_table_of_photos_has_what_the_model_shows_of_each(trained, scene):
+    """Its PSNR are those of renderings and of metrics.json; the lowest comes first."""
+    with (trained / "photos.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    psnrs = [float(row["psnr"]) for row in rows]
+    assert list(rows[0]) == ["photo", "split", "psnr", "sharpness"] and psnrs == sorted(psnrs)
+    assert sorted(row["photo"] for row in rows) == sorted(file.name for file in (scene / "images").iterdir())
+    tested = {name: figures["psnr"] for name, figures in read(trained, "metrics.json")["views"].items()}
+    assert {row["photo"] for row in rows if row["split"] == "test"} == tested.keys()
+    model, cameras = nw.load(trained), load_cameras(trained / "cameras.json")
+    for row, written in zip(rows, psnrs, strict=True):
+        name = row["photo"]
+        rendering = to_uint8(model.render_image(cameras[row["split"]][name]))
+        assert written == pytest.approx(psnr(rendering, picture(scene / "images" / name)), abs=6e-4)
+        assert written == pytest.approx(tested.get(name, written), abs=6e-4)
+
+
+def test_a_blurred_photo_is_the_least_sharp_of_the_table(tmp_path):
+    camera = Camera(torch.eye(4), torch.tensor([[50.0, 0, 24], [0, 50.0, 18], [0, 0, 1]]), 48, 36, 0.1)
+    noise = torch.rand(36, 48, 3, generator=torch.Generator().manual_seed(0))
+    blurred = torch.from_numpy(gaussian_filter(noise.numpy(), (1.5, 1.5, 0)))
+    views = {name: View(camera, to_uint8(image), None, name) for name, image in (("a, b", noise), ("c", blurred))}
+    save_photo_table(tmp_path / "photos.csv", {"train": [*views.values()]}, {name: {"psnr": 20.0} for name in views})
+    with (tmp_path / "photos.csv").open(newline="") as file:
+        sharpness = {row["photo"]: float(row["sharpness"]) for row in csv.DictReader(file)}
+    assert sharpness["c"] < 0.5 * sharpness["a, b"]
+
+
+def test_excluded_photos_stay_out_of_resume_and_eval(scene, tmp_path, capsys):
+    run = tmp_path / "run"
+    command = ["train", str(scene), "--run", str(run), *FLAGS]
+    out = ["--exclude", "view_003.png", "view_00[78].png"]
+    refused(capsys, [*command, "--exclude", "view_9*"], "exclude: no photo of", "is named 'view_9*', as view_000.png")
+    assert cli.main([*command, *out]) == 0
+    assert read(run, "config.json")["scene"]["exclude"] == out[1:]
+    photos = {"view_003.png", "view_007.png", "view_008.png"}
+
+    def left() -> set[str]:
+        cameras = read(run, "cameras.json")
+        return {*cameras["train"], *cameras["test"]}
+
+    assert left() == {file.name for file in (scene / "images").iterdir()} - photos
+    refused(capsys, [*command, "--resume", "--exclude", "view_003.png"], "--exclude: expected", "in the run to resume")
+    before = left()
+    for iterations, options in (("22", []), ("24", out)):
+        assert cli.main([*command, "--resume", "--iterations", iterations, *options]) == 0 and left() == before
+    assert cli.main(["eval", str(run), "--device", "cpu"]) == 0
+    assert list(read(run, "metrics.json")["views"]) == ["view_000.png"]
 
 
 def test_eval_finds_a_scene_that_moved(finished, scene, tmp_path, capsys):

@@ -1,6 +1,9 @@
 """COLMAP scenes: what is read is what was written, and bad input is one clear line."""
 
+import dataclasses
+import json
 import re
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,7 @@ from PIL import Image
 from nexwarp.data import load_scene
 from nexwarp.data.images import downscale_image
 from nexwarp.data.lens import pycolmap_module
+from nexwarp.data.scene import SceneSource
 from nexwarp.errors import MissingError, SceneError
 
 WIDTH, HEIGHT = 48, 36
@@ -126,6 +130,50 @@ def test_every_eighth_view_by_name_is_for_testing(tmp_path):
     for view in views_of(scene):  # poses stay with their names
         expected = pose(names.index(view.name))
         np.testing.assert_allclose(view.camera.viewmat[:3].numpy(), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("names", [["03.png"], ["00.png", "07.png"], ["0[1-4].png", "*8.png"], ["*[1357].png"], []])
+def test_excluded_photos_are_left_out_and_the_others_keep_their_part(tmp_path, names):
+    """The two sets are those of all photos without the excluded ones, with the same pixels and cameras."""
+    path = make_scene(tmp_path)
+    every = load_scene(path)
+    left = load_scene(path, exclude=names)
+    for kept, before in ((left.train, every.train), (left.test, every.test)):
+        expected = [view for view in before if not any(fnmatch(view.name, name) for name in names)]
+        assert [view.name for view in kept] == [view.name for view in expected]
+        for one, other in zip(kept, expected, strict=True):
+            assert torch.equal(one.image, other.image) and torch.equal(one.camera.viewmat, other.camera.viewmat)
+    source = SceneSource(str(path), exclude=tuple(names))
+    assert SceneSource.from_dict(json.loads(json.dumps(dataclasses.asdict(source)))) == source
+    assert len(source.photos()) == len(left.train) + len(left.test)
+
+
+def test_a_name_with_brackets_is_a_name(tmp_path):
+    names = ["a1.png", "a[1].png", "left/b.png", "left/c.png"]
+    path = make_scene(tmp_path, names=names)
+    for pattern, left in {"a[1].png": [0, 2, 3], "left/*": [0, 1], "b*": None, "*b*": [0, 1, 3]}.items():
+        if left is None:
+            with pytest.raises(SceneError, match="no photo"):
+                load_scene(path, exclude=[pattern])
+        else:
+            views = views_of(load_scene(path, exclude=[pattern]))
+            assert [view.name for view in views] == [names[index] for index in left]
+
+
+@pytest.mark.parametrize(
+    ("exclude", "error", "match"),
+    [
+        (["01.png", "1?.png"], SceneError, r"no photo of .* is named '1\?.png', as 00.png is$"),
+        (["01.PNG"], SceneError, "no photo"),
+        (["0[1-7].png", "09.png"], SceneError, "expected to leave a training photo of"),
+        (["*"], SceneError, "expected to leave a training photo of"),
+        ("01.png", TypeError, "exclude: expected a list of names, got str"),
+        ([1], TypeError, "exclude: expected names of photos, got int"),
+    ],
+)
+def test_what_cannot_be_excluded_is_told(tmp_path, exclude, error, match):
+    with pytest.raises(error, match=match):
+        load_scene(make_scene(tmp_path), exclude=exclude)
 
 
 def test_scale_is_the_reach_of_the_training_cameras(tmp_path):

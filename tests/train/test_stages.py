@@ -391,11 +391,11 @@ def test_the_time_left_is_that_of_all_stages(tiny_scene: Scene, tmp_path: Path) 
     session = Session(run, record, Console(quiet=True), Ranks.alone(CPU))
     runner = StageRunner(tiny_scene, CONFIG, CPU, session, own=record.own)
     passes = (CONFIG.smooth_sh > 0) + CONFIG.footprints
-    assert session.left.work == CONFIG.iterations + VIEW_COST * (3 * passes * photos + tests)
+    assert session.left.work == CONFIG.iterations + VIEW_COST * (3 * passes * photos + photos + tests)
     create_run(run, record)
     runner.train()
     runner.finish()
-    assert session.left.work == pytest.approx(VIEW_COST * tests)
+    assert session.left.work == pytest.approx(VIEW_COST * (photos + tests))
 
 
 def test_the_time_left_follows_the_recent_speed() -> None:

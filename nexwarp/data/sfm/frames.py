@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from nexwarp.data.images import downscale_image
 from nexwarp.errors import SceneError, SettingError
 from nexwarp.io.pictures import save_jpeg
 from nexwarp.io.video import check_av, frame_luma, frame_pixels, read_frames
@@ -51,6 +52,11 @@ def sharpness(luma: np.ndarray) -> float:
 
     picture = torch.from_numpy(luma).float()[None, None]
     return float(laplacian(picture, 3).var() / picture.var().clamp_min(1.0))
+
+
+def photo_luma(pixels: torch.Tensor) -> np.ndarray:
+    """Return the (h, w) uint8 brightness of an (H, W, 3) uint8 photo, averaged over blocks if it is twice `SIDE`."""
+    return downscale_image(pixels, max(max(pixels.shape) // SIDE, 1)).float().mean(-1).byte().numpy()
 
 
 def reduced_luma(luma: np.ndarray, longest: int = SIDE) -> np.ndarray:

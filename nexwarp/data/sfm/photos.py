@@ -22,14 +22,13 @@ from nexwarp.data.images import (
     MODEL,
     copy_upright,
     decodable_formats,
-    downscale_image,
     image_size,
     is_turned,
     read_image,
 )
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.scene import GIB, SHARE
-from nexwarp.data.sfm.frames import BLURRED, SIDE, STILL, THUMBNAIL, motion, reduced_luma, sharpness
+from nexwarp.data.sfm.frames import BLURRED, STILL, THUMBNAIL, motion, photo_luma, reduced_luma, sharpness
 from nexwarp.data.sfm.report import SfmOptions
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.machine import available_memory
@@ -200,7 +199,7 @@ def _read_photo(folder: Path, name: str, prepared: Path | None) -> InputPhoto:
         if prepared is not None:
             _link(path, prepared / name)
     height, width = pixels.shape[:2]
-    luma = downscale_image(pixels, max(max(height, width) // SIDE, 1)).float().mean(-1).byte().numpy()
+    luma = photo_luma(pixels)
     del pixels  # before pycolmap reads it
     try:
         camera = pycolmap_module().infer_camera_from_image(str(path))
