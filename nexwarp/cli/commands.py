@@ -1,4 +1,4 @@
-"""`nexwarp process`, `eval`, `render`, `export`, `view`, `info` and `warmup`."""
+"""`nexwarp process`, `eval`, `render`, `edit`, `export`, `view`, `info` and `warmup`."""
 
 import dataclasses
 import math
@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
+import numpy as np
+import torch
 import tyro
 from rich.console import Console
 
@@ -23,9 +25,11 @@ from nexwarp.data.sfm.photos import FILMS, OTHERS, SUFFIXES
 from nexwarp.data.sfm.process import FRAMES, REPORT_FILE, source_identity
 from nexwarp.errors import MissingError, RunError, SceneError
 from nexwarp.io.json_files import READ_ERRORS, Json, read_object, write_json
+from nexwarp.model.edit import write_edits
 from nexwarp.model.model import Model
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.run import warmup
+from nexwarp.run.edit import EditOrder, added
 from nexwarp.run.evaluate import check_metrics, evaluate
 from nexwarp.run.export import RENDERED, ExportOrder, export_run
 from nexwarp.run.fit_poses import fit_poses
@@ -44,6 +48,8 @@ from nexwarp.train.recipe import MASK_MODES, preset
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
+
+MIDDLE = (0.05, 0.95)  # of the surfels' coordinates, for a user's choice of a crop
 
 
 @dataclass
@@ -149,7 +155,7 @@ class Eval:
         opened.folder.mkdir(exist_ok=True)
         with locked_run(opened.folder, partial(display.warn, console)):
             opened = open_model(self.run)  # another process may have changed it
-            model = opened.model.to(device)
+            model = opened.trained.to(device)
             with display.loading(console) as progress:
                 scene = source.load(progress)
             if not scene.test:
@@ -269,6 +275,56 @@ class Export:
 
 
 @dataclass
+class Edit:
+    """Crop, clean, level and scale a run: what render, export and view then show. The trained model never changes.
+
+    One operation at a time; without one, the list of those in effect. They are in RUN/edit.json; train --resume and
+    eval use the model without them. docs/edit.md describes them.
+    """
+
+    run: Run_
+    """Run folder, or a model's folder or .safetensors file."""
+    order: tyro.conf.OmitArgPrefixes[EditOrder] = dataclasses.field(default_factory=EditOrder)
+    device: Device_ = None
+    """Device for --remove-floaters, which renders."""
+
+    def __call__(self, console: Console) -> None:
+        """Edit, and print the list."""
+        self.order.check()
+        device = pick_device(self.device)
+        opened = open_model(self.run)
+        if not opened.file.is_file():
+            raise MissingError(f"{opened.file}: expected a trained model, found none")
+        if self.order != EditOrder():
+            with locked_run(opened.folder, partial(display.warn, console)):
+                opened = open_model(self.run)  # another process may have changed it
+                opened = self._change(opened, device, console)
+        for number, edit in enumerate(opened.edits, 1):
+            console.print(f"{number}. {edit}")
+        means = opened.frame.points(opened.model.surfels.means.detach().cpu().numpy())
+        low, high = (" ".join(f"{x:.4g}" for x in row) for row in np.quantile(means, MIDDLE, axis=0))
+        what = f"{opened.kept.sum():,} of {len(opened.kept):,} surfels; nine of ten along each axis: {low} to {high}"
+        console.print(what, soft_wrap=True)
+
+    def _change(self, opened: OpenedModel, device: torch.device, console: Console) -> OpenedModel:
+        """Write what the order asks for; return the run as it is then."""
+        if self.order.undo:
+            if not opened.edits:
+                raise RunError(f"{opened.folder}: --undo: expected an edit to take back, found none")
+            console.print(f"taken back: {opened.edits[-1]}")
+            write_edits(opened.folder, opened.edits[:-1])
+            return open_model(self.run)
+        with display.stages(console) as observe:
+            edit = self.order.edit(opened, device, observe)
+        assert edit is not None
+        if self.order.remove_floaters:
+            console.print(f"{(count := len(edit.numbers) - 1):,} of {opened.kept.sum():,} surfels are floaters")
+            if count == 0:
+                return opened
+        return added(opened, edit)
+
+
+@dataclass
 class Info:
     """Print a summary of a run or a model."""
 
@@ -310,6 +366,7 @@ def _describe_model(opened: OpenedModel) -> dict[str, str]:
         "K": str(model.options.max_hits),
         "texture": texture,
         "exposures": light,
+        **({"edits": ", ".join(map(str, opened.edits))} if opened.edits else {}),
         "model file": f"{opened.file.stat().st_size / 1e6:.1f} MB",
     }
 
@@ -367,7 +424,9 @@ class ViewCommand:
             lambda: model,
             opened.cameras,
             ViewerOptions(near_depth(model), opened.title, self.host, self.port),
-            save_path=partial(keep_camera_path, opened.folder, opened=self.run, origin=model.origin),
+            save_path=partial(
+                keep_camera_path, opened.folder, opened=self.run, origin=model.origin, frame=opened.frame
+            ),
         ) as viewer:
             show_until_interrupted(viewer, console)
 

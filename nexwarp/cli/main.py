@@ -1,4 +1,4 @@
-"""Command line: `nexwarp train`, `eval`, `render`, `export`, `view`, `info`, `process`, `sfm`, `warmup`."""
+"""Command line: `nexwarp train`, `eval`, `render`, `edit`, `export`, `view`, `info`, `process`, `sfm`, `warmup`."""
 
 import io
 import os
@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 
 from nexwarp.cli import __version__, display
-from nexwarp.cli.commands import Eval, Export, Info, Process, Render, ViewCommand, Warmup
+from nexwarp.cli.commands import Edit, Eval, Export, Info, Process, Render, ViewCommand, Warmup
 from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.errors import NexwarpError, RankError
@@ -29,6 +29,7 @@ COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "train": Train,
     "eval": Eval,
     "render": Render,
+    "edit": Edit,
     "export": Export,
     "view": ViewCommand,
     "info": Info,

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.cameras.paths import up_direction
+from nexwarp.cameras.similarity import upright
 from nexwarp.errors import FormatError
 from nexwarp.export.bake import Baked, Progress, lay_out, measure, points_on
 from nexwarp.export.baked_scene import BakedScene, Header, card_scene
@@ -74,7 +74,7 @@ def make_cards(baked: Baked, alpha: str = "mask") -> BakedScene:
 def save_glb(path: str | os.PathLike[str], scene: BakedScene, cameras: Sequence[Camera]) -> None:
     """Write cards as a glTF 2.0 binary file, atomically: unlit quads with one texture of colours and alpha.
 
-    The mean of the cameras' upward directions becomes +y, by the mesh's node: the vertices stay in the cameras' frame.
+    The cameras' upward direction becomes +y, by the mesh's node: the vertices stay in the cameras' frame.
     FormatError: there are no cards, as no surfel is opaque enough to be seen.
     """
     import trimesh
@@ -100,14 +100,6 @@ def save_glb(path: str | os.PathLike[str], scene: BakedScene, cameras: Sequence[
     world = trimesh.Scene()
     world.add_geometry(mesh, transform=turn)
     write_atomically(Path(path), export_glb(world, tree_postprocessor=_unlit))
-
-
-def upright(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the rotation (3, 3) of the world that turns the scene's upward direction to +y."""
-    up = up_direction(cameras).numpy()
-    side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-    side /= np.linalg.norm(side)
-    return np.stack([side, up, np.cross(side, up)])
 
 
 def quads(scene: BakedScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

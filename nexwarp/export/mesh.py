@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 
 import numpy as np
@@ -11,6 +11,7 @@ import torch
 from numpy.lib.stride_tricks import sliding_window_view
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.similarity import Similarity
 from nexwarp.errors import RunError, SettingError
 from nexwarp.export.bake import Progress
 from nexwarp.io.ply import write_elements
@@ -37,6 +38,11 @@ class Mesh:
     normals: np.ndarray  # (V, 3) float32, unit, towards the side that was seen
     colors: np.ndarray  # (V, 3) uint8 sRGB
     triangles: np.ndarray  # (F, 3) int32, counter-clockwise from the side that was seen
+
+    def moved(self, motion: Similarity) -> "Mesh":
+        """Return the mesh in moved coordinates."""
+        vertices = motion.points(self.vertices).astype(np.float32)
+        return replace(self, vertices=vertices, normals=motion.directions(self.normals))
 
 
 @torch.no_grad()

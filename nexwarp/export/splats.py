@@ -26,9 +26,9 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.similarity import upright
 from nexwarp.errors import FormatError
 from nexwarp.export.bake import points_on
-from nexwarp.export.glb import upright
 from nexwarp.io.files import one_line, write_atomically
 from nexwarp.io.ply import write_elements
 from nexwarp.kernels.sh import BAND_0

@@ -10,9 +10,10 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.similarity import upright
 from nexwarp.errors import FormatError
 from nexwarp.export.baked_scene import BakedScene
-from nexwarp.export.glb import quads, upright
+from nexwarp.export.glb import quads
 from nexwarp.export.splats import gaussians
 from nexwarp.io.files import write_atomically
 from nexwarp.io.pictures import to_uint8

@@ -244,3 +244,11 @@ def check_coefficients(name: str, count: int) -> None:
         counts = f"{', '.join(map(str, most))} or {last}"
         removed = "; SH degrees above 3 were removed" if count in (25, 36, 49) else ""
         raise ValueError(f"{name}: expected {counts} spherical harmonics coefficients, got {count}{removed}")
+
+
+def harmonics(means: torch.Tensor, position: torch.Tensor, count: int) -> torch.Tensor:
+    """Return the harmonics (N, C) of the directions from a position (3,) to means (N, 3), as derivatives of colours."""
+    sh = means.new_zeros(len(means), count, 3).requires_grad_()
+    with torch.enable_grad():
+        colors = ops.plain_colors(sh, means, position, round(count**0.5) - 1)
+        return torch.autograd.grad(colors.sum(), sh)[0][..., 0]

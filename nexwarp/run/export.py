@@ -14,6 +14,7 @@ from tyro.conf import arg
 from nexwarp.cameras.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
+from nexwarp.cameras.similarity import IDENTITY
 from nexwarp.data import View
 from nexwarp.data.images import image_size
 from nexwarp.data.scene import DEMO, SceneSource, demo_folder
@@ -36,6 +37,7 @@ from nexwarp.export.usd import save_usdz
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import JsonObject, write_json
 from nexwarp.model.compact import NOISE, NOISES
+from nexwarp.model.edit import moved_poses, moved_surfels
 from nexwarp.model.model_file import save_model
 from nexwarp.run.evaluate import compared, psnr
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
@@ -111,12 +113,14 @@ def export_run(
     order.check()
     folder = order.out or opened.folder / EXPORT_FOLDER
     baked = order.format in BAKED
-    train, test = _photos(opened, observe) if baked and order.finetune and opened.source is not None else ([], [])
+    fitted = baked and order.finetune and opened.source is not None
+    # Photos show what edits have removed.
+    train, test = _photos(opened, observe) if fitted and opened.kept.all() else ([], [])
     files = [*_export(opened, order, folder, train, device, observe)]
     if test and order.format in READ:
         report(_quality(opened, files, test, device))
     # Compact models and cameras say themselves where their frame lies in the world.
-    if order.format not in ("compact", "cameras") and any(opened.model.origin or ()):
+    if order.format not in ("compact", "cameras") and any(opened.model.origin or ()) and opened.frame.is_identity:
         files.append((folder.parent if folder.suffix == ".html" else folder) / ORIGIN_FILE)
         meaning = "world position = origin + exported position"
         write_json(files[-1], {"origin": opened.model.origin, "meaning": meaning})
@@ -150,8 +154,10 @@ def _export(
         trained = opened.cameras.get(TRAIN, {})
         if not trained:
             raise RunError(f"{opened.folder / CAMERAS_FILE}: expected training cameras, found none")
-        model = opened.model.to(device)
-        save_mesh(files[0], extract_mesh(model, [*trained.values()], voxel=order.voxel, far=order.far, observe=observe))
+        model, scale = opened.model.to(device), opened.frame.scale
+        voxel, far = (None if x is None else x / scale for x in (order.voxel, order.far))
+        mesh = extract_mesh(model, [*trained.values()], voxel=voxel, far=far, observe=observe)
+        save_mesh(files[0], mesh.moved(opened.frame))
     elif order.format == "compact":
         save_model(files[0], opened.model, compact=_noise(opened) if order.noise is None else order.noise)
     else:
@@ -169,19 +175,24 @@ def _export_geometry(
     observe: Progress,
 ) -> None:
     """Write surfels as textured cards or as Gaussians."""
-    surfels, degree = opened.model.surfels, min(opened.model.options.sh_degree, SPLAT_DEGREE)
+    motion, degree = opened.frame, min(opened.model.options.sh_degree, SPLAT_DEGREE)
+    surfels = moved_surfels(opened.model.surfels, motion)
+    moved = [motion.camera(camera) for camera in cameras]
     if order.format in ("glb", "usd"):
         if not cameras:
             raise RunError(f"{opened.path}: --format {order.format}: expected the run's {CAMERAS_FILE}, found none")
         cards = bake_cards(opened.model.to(device), seen or cameras, order.alpha, progress=observe)
+        means, quats = moved_poses(cards.shape.means, cards.shape.quats, motion)
+        shape = cards.shape._replace(means=means, quats=quats, scales=cards.shape.scales * motion.scale)
+        cards = replace(cards, shape=shape)
         if order.format == "glb":
-            save_glb(files[0], cards, cameras)
+            save_glb(files[0], cards, moved)
         else:
-            save_usdz(files[0], cards, surfels, degree, cameras)
+            save_usdz(files[0], cards, surfels, degree, moved)
         return
     if order.format == "ply":
         save_surfels_ply(files[0], surfels)
-    SPLAT_WRITERS[order.format](files[-1], surfels, degree, cameras=cameras, max_extent=order.max_extent)
+    SPLAT_WRITERS[order.format](files[-1], surfels, degree, cameras=moved, max_extent=order.max_extent)
 
 
 def _photos(opened: OpenedModel, observe: Progress) -> tuple[list[View], list[View]]:
@@ -207,11 +218,12 @@ def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], 
     model = opened.model.to(device)
     file = next(file for file in files if file.suffix in (".html", GLB))
     scene, exposures = load_baked(file).to(device), None
+    motion = opened.frame if file.suffix == GLB else IDENTITY
     if scene.exposures is None and model.options.exposure == "photos":
         exposures = model.exposures
 
     def shown(camera: Camera) -> torch.Tensor:
-        image = scene.render(camera, background=model.options.background)
+        image = scene.render(motion.camera(camera), background=model.options.background)
         return image if exposures is None else image * exposures.factors(camera)
 
     baked, neural = (
@@ -231,7 +243,8 @@ def _noise(opened: OpenedModel) -> float:
 def _export_cameras(opened: OpenedModel, transforms: Path, camera_path: Path) -> None:
     """Write the cameras of a run for nerfstudio, with the lenses and sizes of the photos as they lie in their files."""
     names, lenses = _originals(opened)
-    named = {group: {names[name]: camera for name, camera in cs.items()} for group, cs in opened.cameras.items()}
+    move = opened.frame.camera
+    named = {group: {names[name]: move(camera) for name, camera in cs.items()} for group, cs in opened.cameras.items()}
     cameras = dict(sorted({name: c for members in named.values() for name, c in members.items()}.items()))
     if not cameras:
         raise RunError(f"{opened.folder / CAMERAS_FILE}: expected at least one camera, found none")

@@ -1,7 +1,7 @@
 """Run folders: the names of their files, creating, locking, checking, reading and opening them.
 
 A run holds `config.json` (scene and settings), `model.safetensors`, `cameras.json`, `metrics.json`, `metrics.jsonl`,
-`renders/` and `checkpoint/`; docs/format.md describes the files.
+perhaps `edit.json`, `renders/` and `checkpoint/`; docs/format.md describes the files.
 """
 
 import dataclasses
@@ -18,16 +18,21 @@ from pathlib import Path
 from platform import node
 from typing import Any
 
+import numpy as np
+import torch
 from filelock import BaseFileLock, FileLock, Timeout
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import save_camera_path
 from nexwarp.cameras.paths import PATHS, surrounding
+from nexwarp.cameras.similarity import IDENTITY, Similarity
 from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError, check_version
 from nexwarp.io.files import is_abandoned, is_temporary, make_folders, one_line, remove_empty, sync, written_aside
 from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
+from nexwarp.model.crop import select
+from nexwarp.model.edit import EDIT_FILE, Edit, frame_of, kept_surfels, read_edits
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load
 from nexwarp.train.checkpoint import CHECKPOINT_FILES, CHECKPOINTS
@@ -42,7 +47,7 @@ DIVERGED_FILE = "diverged.json"  # of versions up to 0.2
 LOCK_FILE = "run.lock"
 WANDB_FILE = "wandb.json"  # of versions up to 0.2
 CAMERA_PATH = "camera_path_{}.json"
-RESULTS = (MODEL_FILE, CAMERAS_FILE, METRICS_FILE, PHOTOS_FILE)
+RESULTS = (MODEL_FILE, CAMERAS_FILE, METRICS_FILE, PHOTOS_FILE, EDIT_FILE)
 ROOT_FILES = (CONFIG_FILE, *RESULTS, LOG_FILE, DIVERGED_FILE, LOCK_FILE, WANDB_FILE)
 
 TEACHERS_FOLDER = "teachers"
@@ -410,8 +415,13 @@ def keep_camera_path(
     cameras: Sequence[Camera],
     opened: Path | None = None,
     origin: tuple[float, float, float] | None = None,
+    frame: Similarity = IDENTITY,
 ) -> str:
-    """Write cameras of a frame with `origin` into a folder; return the command that renders `opened` from there."""
+    """Write cameras of a frame with `origin` into a folder; return the command that renders `opened` from there.
+
+    The file has the coordinates of `frame`, an edited model's.
+    """
+    cameras = [frame.camera(dataclasses.replace(camera, origin=origin or camera.origin)) for camera in cameras]
     folder.mkdir(parents=True, exist_ok=True)
     number = 1
     while True:
@@ -421,7 +431,7 @@ def keep_camera_path(
         except FileExistsError:
             number += 1
             continue
-        save_camera_path(path, [dataclasses.replace(camera, origin=origin or camera.origin) for camera in cameras])
+        save_camera_path(path, cameras)
         return f"nexwarp render {opened or folder} --path {path}"
 
 
@@ -441,9 +451,32 @@ class OpenedModel:
         return self.folder.resolve().name if self.source is None else self.source.name
 
     @cached_property
-    def model(self) -> Model:
-        """The model, on the CPU."""
+    def trained(self) -> Model:
+        """The model as it was trained, on the CPU."""
         return load(self.file)
+
+    @cached_property
+    def edits(self) -> list[Edit]:
+        """The edits in effect, which `nexwarp edit` has written beside the model. FormatError: the file is damaged."""
+        return read_edits(self.folder)
+
+    @cached_property
+    def kept(self) -> np.ndarray:
+        """Which trained surfels (N,) bool the edits leave. RunError: the edits do not fit the model."""
+        try:
+            return kept_surfels(self.trained.surfels, self.edits)
+        except ValueError as error:
+            raise RunError(f"{self.folder / EDIT_FILE}: {error}") from None
+
+    @cached_property
+    def model(self) -> Model:
+        """The part of the trained model that the edits leave, on the CPU, in the frame of the training."""
+        return self.trained if self.kept.all() else select(self.trained, torch.from_numpy(self.kept))
+
+    @property
+    def frame(self) -> Similarity:
+        """The motion from the frame of the training, which is that of `cameras`, to the edited coordinates."""
+        return frame_of(self.edits)
 
     @cached_property
     def cameras(self) -> dict[str, dict[str, Camera]]:

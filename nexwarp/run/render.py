@@ -17,10 +17,12 @@ from nexwarp.cameras.cameras_file import CAMERAS_FILE, WORLD
 from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.cameras.paths import PATHS, suited_path
 from nexwarp.cameras.ray_camera import MAX_SIDE, RayCamera
+from nexwarp.cameras.similarity import IDENTITY, Similarity
 from nexwarp.errors import RunError, SettingError
 from nexwarp.io.pictures import save_png, to_uint8
 from nexwarp.io.video import check_video, video_writer
 from nexwarp.model.buffers import render_buffers, save_buffers
+from nexwarp.model.edit import moved_buffers
 from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.ops.tiles import Order
@@ -157,7 +159,7 @@ class RenderOrder:
         if not pictures:
             file = opened.folder / CAMERAS_FILE
             raise RunError(f"{file}: expected {self.views} views to render, found none; see --path")
-        return RenderJob(pictures, self, fps if self.fps is None else self.fps, name)
+        return RenderJob(pictures, self, fps if self.fps is None else self.fps, name, opened.frame)
 
     def _path(self, name: str, opened: OpenedModel, renders: Path) -> tuple[Path, list[Camera], float]:
         """Return the folder of the frames, their cameras, and the frames per second."""
@@ -166,13 +168,16 @@ class RenderOrder:
             if self.frames is not None:
                 raise SettingError(f"--frames: expected no value with {file}, which sets it, got {self.frames}")
             near = next((c.near for group in opened.cameras.values() for c in group.values()), near_depth(opened.model))
-            path = load_camera_path(file, near, opened.model.origin or WORLD)
-            return renders / FILE_PATH.format(file.stem), path.cameras, path.fps or FPS
+            frame = opened.frame
+            origin = (opened.model.origin if frame.is_identity else None) or WORLD
+            path = load_camera_path(file, near * frame.scale, origin)
+            cameras = [frame.inverse().camera(camera) for camera in path.cameras]
+            return renders / FILE_PATH.format(file.stem), cameras, path.fps or FPS
         count = FRAMES if self.frames is None else self.frames
-        cameras = opened.path_cameras()
-        views = cameras.get(TRAIN, {})
+        groups = opened.path_cameras()
+        views = groups.get(TRAIN, {})
         if name == "interpolate":
-            views = dict(sorted((views | cameras.get(TEST, {})).items()))
+            views = dict(sorted((views | groups.get(TEST, {})).items()))
         try:
             return renders / name, PATHS[name](list(views.values()), count), FPS
         except ValueError as error:
@@ -219,6 +224,7 @@ class RenderJob:
     order: RenderOrder
     fps: float = FPS
     path: str | None = None  # name of the path, if any
+    frame: Similarity = IDENTITY  # from that of the cameras to the coordinates of the buffers
 
     def __len__(self) -> int:
         return len(self.pictures)
@@ -242,7 +248,7 @@ class RenderJob:
             for picture in self.pictures:
                 if picture.buffers:
                     buffers = render_buffers(model, picture.camera, **changes)
-                    save_buffers(picture.file.with_suffix(".exr"), buffers)
+                    save_buffers(picture.file.with_suffix(".exr"), moved_buffers(buffers, self.frame))
                     image = buffers.image
                 else:
                     image = model.render(projected(self.order, picture.camera), **changes).image

@@ -18,14 +18,13 @@ from typing import TypeVar
 
 import torch
 
-from nexwarp import ops
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import View
 from nexwarp.kernels.types import ALPHA_MIN
 from nexwarp.machine import deterministic
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
-from nexwarp.model.surfels import Surfels
+from nexwarp.model.surfels import Surfels, harmonics
 from nexwarp.model.texture import NEVER, DetailLimits
 from nexwarp.train.recipe import Config
 from nexwarp.train.target import with_cameras
@@ -163,7 +162,7 @@ def seen_directions(
         counts = torch.ones_like(out.alpha) if view.mask is None else view.mask.to(out.alpha)
         weights = out.splat_error(counts)[ids].double()
         for seen in weights.nonzero()[:, 0].split(SOLVED // count**2):
-            basis = _basis(surfels.means.detach()[ids[seen]], camera.position, count).double()
+            basis = harmonics(surfels.means.detach()[ids[seen]], camera.position, count).double()
             products[seen] += weights[seen, None] * basis[:, row] * basis[:, column]
         total += weights
         progress(number)
@@ -173,11 +172,3 @@ def seen_directions(
 def _count(model: Model) -> int:
     """Return the number of coefficients per channel that are rendered."""
     return min(model.surfels.shN.shape[1] + 1, (model.options.sh_degree + 1) ** 2)
-
-
-def _basis(means: torch.Tensor, position: torch.Tensor, count: int) -> torch.Tensor:
-    """Return the harmonics (N, C) of the directions to the surfels, as derivatives of their colours."""
-    sh = means.new_zeros(len(means), count, 3).requires_grad_()
-    with torch.enable_grad():
-        colors = ops.plain_colors(sh, means, position, round(count**0.5) - 1)
-        return torch.autograd.grad(colors.sum(), sh)[0][..., 0]

@@ -9,8 +9,9 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp.cameras.similarity import upright
 from nexwarp.export.bake import Baked, bake, evaluate, lay_out, observe
-from nexwarp.export.glb import CUTOFF, make_cards, save_glb, upright
+from nexwarp.export.glb import CUTOFF, make_cards, save_glb
 from nexwarp.export.splats import save_splats_spz
 from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE, encode_atlas, encode_baked, encode_harmonics
 from tests.export.web import support

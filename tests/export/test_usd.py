@@ -8,9 +8,10 @@ import pytest
 import torch
 from PIL import Image
 
+from nexwarp.cameras.similarity import upright
 from nexwarp.errors import FormatError
 from nexwarp.export.bake import bake
-from nexwarp.export.glb import make_cards, quads, upright
+from nexwarp.export.glb import make_cards, quads
 from nexwarp.export.usd import save_usdz
 from nexwarp.io.pictures import to_uint8
 from tests.export.test_bake import make_model

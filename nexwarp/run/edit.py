@@ -1,0 +1,120 @@
+"""Edits of a run: the choice of one operation, and what it needs to know of the scene."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import torch
+from tyro.conf import arg
+
+from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.cameras_file import CAMERAS_FILE
+from nexwarp.cameras.similarity import Similarity, upright
+from nexwarp.errors import RunError, SettingError
+from nexwarp.export.bake import Progress
+from nexwarp.model.crop import REGIONS
+from nexwarp.model.edit import REMOVE, Edit, checksum, moved_surfels, write_edits
+from nexwarp.model.floaters import find_floaters
+from nexwarp.run.folder import TRAIN, OpenedModel
+
+LEVEL = 0.9  # least height of the normal of a surfel that may be ground
+REACH = 2.0  # of the surfels that may be ground, in distances of the farthest camera from the middle of all
+GROUND = 0.2  # share of the area of such surfels below the cameras that lies below the ground's height
+
+
+@dataclass(frozen=True)
+class EditOrder:
+    """The operation of `nexwarp edit`, one at a time. Positions and lengths are those of the last export."""
+
+    crop: Annotated[
+        tuple[str, ...] | None, arg(metavar="{box X0 Y0 Z0 X1 Y1 Z1,sphere X Y Z R}", help_behavior_hint="")
+    ] = None
+    """Keep the surfels whose centres lie in a box along the axes, or in a sphere."""
+    remove_floaters: Annotated[bool, arg(help_behavior_hint="")] = False
+    """Remove surfels in empty space that few training views agree on."""
+    level: Annotated[bool, arg(help_behavior_hint="")] = False
+    """Turn the scene's upward direction to +y, and put the ground at y = 0."""
+    scale: Annotated[float | None, arg(metavar="FACTOR", help_behavior_hint="")] = None
+    """Multiply all coordinates."""
+    scale_between: Annotated[
+        tuple[float, float, float, float, float, float, float] | None,
+        arg(metavar="X Y Z X Y Z LENGTH", help_behavior_hint=""),
+    ] = None
+    """Scale so that two points get this distance, such as one that you have measured."""
+    origin: Annotated[tuple[float, float, float] | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
+    """Make this point (0, 0, 0)."""
+    undo: Annotated[bool, arg(help_behavior_hint="")] = False
+    """Take the last operation back."""
+
+    def check(self) -> None:
+        """Raise SettingError unless there is at most one operation, with numbers that fit."""
+        asked = [name for name, value in vars(self).items() if value is not None and value is not False]
+        if len(asked) > 1:
+            names = ", ".join(f"--{name.replace('_', '-')}" for name in asked)
+            raise SettingError(f"{names}: expected one operation at a time, got {len(asked)}")
+        try:
+            self._given()
+        except ValueError as error:
+            raise SettingError(f"--{asked[0].replace('_', '-')}: {error}") from None
+
+    def _given(self) -> Edit | None:
+        """Return the edit that the options give alone, whatever the scene; ValueError where its numbers do not fit."""
+        if self.crop is not None:
+            if self.crop[:1] not in [(name,) for name in REGIONS]:
+                raise ValueError(f"expected box or sphere, and numbers, got {' '.join(self.crop)!r:.60}")
+            return Edit(self.crop[0], tuple(map(float, self.crop[1:])))
+        if self.scale_between is not None:
+            *ends, length = self.scale_between
+            distance = math.dist(ends[:3], ends[3:])
+            return Edit("scale", (length / distance if distance else math.inf,))
+        if self.scale is not None:
+            return Edit("scale", (self.scale,))
+        return None if self.origin is None else Edit("origin", self.origin)
+
+    def edit(self, opened: OpenedModel, device: torch.device | str, observe: Progress = lambda *_: None) -> Edit | None:
+        """Return the operation on a run, or None; floaters are looked for on `device`, and `observe` told of it."""
+        if self.remove_floaters:
+            found = find_floaters(opened.model.to(device), _training_cameras(opened), observe).numpy()
+            removed = opened.kept.nonzero()[0][found]
+            return Edit(REMOVE, (checksum(opened.trained.surfels), *removed.tolist()))
+        if self.level:
+            motion = _levelling(opened)
+            return Edit("level", (*motion.rotation.ravel().tolist(), *motion.shift.tolist()))
+        return self._given()
+
+
+def _training_cameras(opened: OpenedModel) -> list[Camera]:
+    if not (cameras := opened.cameras.get(TRAIN)):
+        raise RunError(f"{opened.folder / CAMERAS_FILE}: expected training cameras, found none")
+    return [*cameras.values()]
+
+
+def _levelling(opened: OpenedModel) -> Similarity:
+    """Return the motion from a run's coordinates to levelled ones.
+
+    A fifth of the level surface lies below the ground, of what is below the middle of the cameras and at most twice as
+    far from it as they are.
+    """
+    cameras = [opened.frame.camera(camera) for camera in _training_cameras(opened)]
+    turn = Similarity(upright(cameras), np.zeros(3))
+    surfels = moved_surfels(opened.model.surfels, opened.frame.then(turn))
+    places = turn.points(np.stack([camera.position.numpy() for camera in cameras]))
+    middle, means = places.mean(0), surfels.means.detach().numpy()
+    near = np.linalg.norm(means - middle, axis=1) <= REACH * np.linalg.norm(places - middle, axis=1).max()
+    level = near & (np.abs(surfels.normals.detach().numpy()[:, 1]) >= LEVEL) & (means[:, 1] < middle[1])
+    level = level if level.any() else np.ones(len(means), bool)
+    order = np.argsort(means[level, 1])
+    areas = (surfels.scales.prod(1) * surfels.opacities).detach().double().numpy()[level][order].cumsum()
+    ground = means[level, 1][order][np.searchsorted(areas, GROUND * areas[-1])]
+    return turn.then(Similarity(np.eye(3), np.array([0.0, -ground, 0.0])))
+
+
+def added(opened: OpenedModel, edit: Edit) -> OpenedModel:
+    """Write one more edit of a run, and return the run with it; RunError, and no file changes, if nothing is left."""
+    changed = dataclasses.replace(opened)
+    vars(changed).update(trained=opened.trained, edits=[*opened.edits, edit])
+    _ = changed.kept  # which checks them
+    write_edits(opened.folder, changed.edits)
+    return changed

@@ -1,0 +1,177 @@
+"""`nexwarp edit`: what it writes, what render, export and view then show, and what it refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from nexwarp.cameras.paths import up_direction
+from nexwarp.cli import main as cli
+from nexwarp.data.ply import read_vertices
+from nexwarp.export.baked_scene import load_baked
+from nexwarp.model.buffers import load_buffers
+from nexwarp.model.edit import EDIT_FILE
+from nexwarp.model.model_file import load
+from nexwarp.run.folder import keep_camera_path, open_model
+from tests.cli.support import picture, read, refused, snapshot
+from tests.tolerances import assert_close
+
+pytestmark = pytest.mark.usefixtures("small_preset")
+MOVES = (["--level"], ["--scale-between", "0", "0", "0", "0", "-2", "0", "7"], ["--origin", "-1", "2e0", "-.5"])
+
+
+def edit(run: Path, *arguments: str) -> None:
+    assert cli.main(["edit", str(run), *arguments]) == 0
+
+
+def centres(run):
+    vertices = read_vertices(run / "export" / "surfels.ply")
+    return np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(float)
+
+
+def test_a_levelled_and_scaled_run_looks_the_same_from_the_moved_cameras(finished):
+    """In pictures, and in buffers: depths are in the new units, normals in the new axes."""
+    assert cli.main(["render", str(finished), "--set", "test", "--buffers", "--device", "cpu"]) == 0
+    names = sorted(read(finished, "cameras.json")["test"])
+    stills = [finished / "renders" / "test" / name for name in names]
+    before = [picture(file) for file in stills]
+    buffers = [load_buffers(file.with_suffix(".exr")) for file in stills]
+    for move in MOVES:
+        edit(finished, *move)
+    opened = open_model(finished)
+    assert opened.frame.scale == 3.5
+    moved = [opened.frame.camera(camera) for camera in opened.cameras["test"].values()]
+    assert np.allclose(up_direction(moved), [0, 1, 0], atol=0.02)
+    keep_camera_path(finished, [opened.cameras["test"][name] for name in names], frame=opened.frame)
+    path = finished / "camera_path_1.json"
+    assert cli.main(["render", str(finished), "--path", str(path), "--buffers", "--device", "cpu"]) == 0
+    turn = torch.from_numpy(opened.frame.rotation).float()
+    for number, (image, old) in enumerate(zip(before, buffers, strict=True)):
+        file = finished / "renders" / "path_camera_path_1" / f"{number:04d}.png"
+        assert (picture(file).int() - image.int()).abs().max() <= 1
+        new = load_buffers(file.with_suffix(".exr"))
+        assert_close(new.image, old.image, kind="value", name="image", allow_flips=0.005)
+        assert_close(new.median_depth, 3.5 * old.median_depth, kind="value", name="depth", allow_flips=0.005)
+        assert_close(new.normals, old.normals @ turn.T, kind="gradient", name="normals", allow_flips=0.005)
+        assert_close(new.camera.viewmat, opened.frame.camera(old.camera).viewmat, kind="value", name="camera")
+
+
+def test_exports_are_in_the_new_coordinates_and_hold_what_is_left(finished):
+    assert cli.main(["export", str(finished)]) == 0
+    before = centres(finished)
+    edit(finished, "--scale", "2")
+    edit(finished, "--origin", "1", "0", "0")
+    edit(finished, "--crop", "box", "-2", "-50", "-50", "0.5", "50", "50")
+    assert cli.main(["export", str(finished)]) == 0
+    new = 2 * before - [1, 0, 0]
+    left = (new[:, 0] >= -2) & (new[:, 0] <= 0.5)
+    assert 0 < left.sum() < len(new)
+    assert np.allclose(centres(finished), new[left], atol=1e-5)
+    assert len(load(finished).surfels) == len(new), "the model's file and nexwarp.load have all surfels"
+    for kind in ("compact", "cameras"):
+        assert cli.main(["export", str(finished), "--format", kind]) == 0
+    assert len(load(finished / "export" / "compact.safetensors").surfels) == left.sum()
+    first = read(finished / "export", "camera_path.json")["camera_path"][0]["camera_to_world"]
+    places = [2 * camera.position - torch.tensor([1.0, 0, 0]) for group in open_model(finished).cameras.values()
+              for camera in group.values()]  # fmt: skip
+    assert any(np.allclose(place, first[3:12:4], atol=1e-4) for place in places)
+
+
+def test_undo_gives_the_same_bits_and_evaluation_never_sees_edits(finished, capsys):
+    assert cli.main(["export", str(finished)]) == 0
+    model, exported = (finished / "model.safetensors").read_bytes(), snapshot(finished / "export")
+    for arguments in (["--crop", "sphere", "0", "0", "0", "1.5"], *MOVES):
+        edit(finished, *arguments)
+    assert cli.main(["eval", str(finished), "--device", "cpu"]) == 0
+    metrics = read(finished, "metrics.json")
+    capsys.readouterr()
+    edit(finished)
+    out = capsys.readouterr().out.splitlines()
+    assert [line[:8] for line in out[:4]] == ["1. crop ", "2. level", "3. scale", "4. origi"] and len(out) == 5
+    assert cli.main(["info", str(finished)]) == 0
+    assert "crop sphere 0 0 0 1.5" in capsys.readouterr().out
+    for _ in range(4):
+        edit(finished, "--undo")
+    assert not (finished / EDIT_FILE).exists() and (finished / "model.safetensors").read_bytes() == model
+    assert cli.main(["export", str(finished)]) == 0
+    assert snapshot(finished / "export") == exported
+    assert cli.main(["eval", str(finished), "--device", "cpu"]) == 0
+    assert read(finished, "metrics.json") == metrics
+    refused(capsys, ["edit", str(finished), "--undo"], "--undo", "found none")
+
+
+def test_floaters_are_counted_and_belong_to_one_model(finished, capsys, monkeypatch):
+    monkeypatch.setattr("nexwarp.run.edit.find_floaters", lambda model, *_: torch.arange(len(model.surfels)) < 3)
+    count = len(load(finished).surfels)
+    edit(finished, "--crop", "sphere", "0", "0", "0", "1.5")
+    left = len(open_model(finished).model.surfels)
+    edit(finished, "--remove-floaters", "--device", "cpu")
+    assert f"3 of {left:,} surfels are floaters" in capsys.readouterr().out and left < count
+    assert len(open_model(finished).model.surfels) == left - 3
+    monkeypatch.setattr("nexwarp.run.edit.find_floaters", lambda model, *_: torch.zeros(len(model.surfels)) > 0)
+    before = snapshot(finished)
+    edit(finished, "--remove-floaters", "--device", "cpu")
+    assert snapshot(finished) == before, "none found"
+    model = load(finished)
+    with torch.no_grad():
+        model.surfels.means.add_(1)
+    model.save(finished)
+    refused(capsys, ["export", str(finished)], EDIT_FILE, "has changed since remove 3 floaters", "--undo")
+    refused(capsys, ["edit", str(finished), "--undo", "--level"], "one operation")
+    edit(finished, "--undo")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--crop"], ["--crop", "box or sphere"]),
+        (["--crop", "ring", "1"], ["--crop", "ring"]),
+        (["--crop", "box", "0", "0", "0", "1", "1"], ["box: expected 6 numbers, got 5"]),
+        (["--crop", "box", "0", "0", "0", "1", "1", "x"], ["--crop", "'x'"]),
+        (["--crop", "box", "0", "0", "0", "1", "-1", "1"], ["lowest and a highest corner"]),
+        (["--crop", "sphere", "0", "0", "0", "0"], ["sphere: expected at least"]),
+        (["--crop", "sphere", "99", "0", "0", "1e-3"], ["leaves none of"]),
+        (["--scale", "0"], ["--scale", "expected at least"]),
+        (["--scale", "nan"], ["--scale", "nan"]),
+        (["--scale-between", "1", "1", "1", "1", "1", "1", "2"], ["--scale-between", "inf"]),
+        (["--origin", "inf", "0", "0"], ["--origin", "inf"]),
+        (["--level", "--scale", "2"], ["--level, --scale", "one operation"]),
+    ],
+)
+def test_bad_edits_change_nothing(arguments, words, finished, capsys):
+    edit(finished, "--scale", "2")
+    before = snapshot(finished)
+    refused(capsys, ["edit", str(finished), *arguments], *words)
+    assert snapshot(finished) == before
+
+
+def test_damaged_edits_are_named_by_every_command(finished, capsys):
+    (finished / EDIT_FILE).write_text(json.dumps({"format_version": 1, "edits": [{"name": "paint", "numbers": []}]}))
+    for command in (["edit"], ["render"], ["export"], ["info"], ["edit", "--undo"]):
+        refused(capsys, [command[0], str(finished), *command[1:]], EDIT_FILE, "paint")
+
+
+def test_baked_exports_move_too(finished, monkeypatch):
+    """Cards, and their pictures from the moved cameras; photos of what was cropped are not fitted."""
+    pytest.importorskip("trimesh")
+    monkeypatch.setattr("nexwarp.export.fit.FEWEST_STEPS", 2)
+    monkeypatch.setattr("nexwarp.export.glb.CUTOFF", 0.05)  # surfels of a short training are faint
+    command, file = ["export", str(finished), "--format", "glb", "--device", "cpu"], finished / "export" / "scene.glb"
+    assert cli.main(command) == 0
+    before = load_baked(file)
+    for move in MOVES:
+        edit(finished, *move)
+    assert cli.main(command) == 0
+    after, opened = load_baked(file), open_model(finished)
+    expected = opened.frame.points(before.shape.means.numpy())
+    assert np.allclose(after.shape.means.numpy(), expected, atol=1e-4)
+    assert_close(after.shape.scales, 3.5 * before.shape.scales, kind="gradient", name="half sides")
+    camera = next(iter(opened.cameras["test"].values()))
+    image = after.render(opened.frame.camera(camera))
+    assert_close(image, before.render(camera), kind="gradient", name="image", allow_flips=0.005)
+    edit(finished, "--crop", "box", *map(str, np.quantile(expected, (0.1, 0.9), axis=0).ravel()))
+    monkeypatch.setattr("nexwarp.run.export._photos", None)
+    assert cli.main(command) == 0
+    assert 0 < len(load_baked(file).shape.means) < len(expected)
