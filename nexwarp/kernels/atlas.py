@@ -251,7 +251,9 @@ def blend_kernel(real: type, cards: bool, cut: bool, backward: bool) -> wp.Kerne
             if wp.static(backward) and alpha > ZERO:
                 q = wp.dot(grad, shown) + grads.alphas[p]
                 rest -= q * weight
-                row = vec4(ZERO, ZERO, ZERO, slope * (transmittance * q - rest / (ONE - alpha)))
+                row = vec4()
+                if slope != ZERO:  # a cut-out's coverage is 1, where the quotient is none
+                    row[3] = slope * (transmittance * q - rest / (ONE - alpha))
                 for channel in range(3):
                     row[channel] = wp.where(color[channel] > ZERO, grad[channel] * weight, ZERO)
                 if wp.static(not cards):

@@ -203,6 +203,14 @@ def test_damaged_files_give_one_line(files, baked, cameras, tmp_path):
         assert re.fullmatch(r".*bad.*expected.*", str(error.value)), "one line that names the file"
 
 
+def test_a_threshold_has_no_gradient_of_alpha():
+    scene, camera = random_baked("mask")
+    texels = scene.texels.requires_grad_()
+    scene.render(camera).square().sum().backward()
+    grad = present(texels.grad)
+    assert grad.isfinite().all() and (grad[..., 3] == 0).all() and grad[..., :3].abs().max() > 0
+
+
 @pytest.mark.cuda
 @pytest.mark.parametrize("form", ["surfels", "blend", "mask", "soft"])
 def test_a_gpu_draws_what_the_cpu_draws(form):
