@@ -316,12 +316,10 @@ class Edit:
             return open_model(self.run)
         with display.stages(console) as observe:
             edit = self.order.edit(opened, device, observe)
-        assert edit is not None
         if self.order.remove_floaters:
-            console.print(f"{(count := len(edit.numbers) - 1):,} of {opened.kept.sum():,} surfels are floaters")
-            if count == 0:
-                return opened
-        return added(opened, edit)
+            count = 0 if edit is None else len(edit.numbers) - 1
+            console.print(f"{count:,} of {opened.kept.sum():,} surfels are floaters")
+        return opened if edit is None else added(opened, edit)
 
 
 @dataclass

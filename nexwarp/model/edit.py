@@ -58,7 +58,7 @@ class Edit:
             raise ValueError(f"box: expected a lowest and a highest corner, got {self.numbers}")
         if self.name in ("sphere", "scale"):
             check_range(self.name, self.numbers[-1], *SCALES)
-        if self.name == REMOVE and not (self.numbers and all(type(x) is int and x >= 0 for x in self.numbers)):
+        if self.name == REMOVE and not (len(self.numbers) > 1 and all(type(x) is int and x >= 0 for x in self.numbers)):
             raise ValueError(f"{REMOVE}: expected a checksum and indices")
 
     def __str__(self) -> str:
@@ -98,7 +98,7 @@ def kept_surfels(surfels: Surfels, edits: Sequence[Edit]) -> np.ndarray:
     for number, edit in enumerate(edits):
         if edit.name in REGIONS:
             kept &= inside(edit.name, edit.numbers, frame_of(edits[:number]).points(means))
-        elif edit.name == REMOVE and edit.numbers[0] != checksum(surfels):
+        elif edit.name == REMOVE and (edit.numbers[0] != checksum(surfels) or max(edit.numbers[1:]) >= len(kept)):
             raise ValueError(f"the model has changed since {edit}; take that back with nexwarp edit --undo")
         elif edit.name == REMOVE:
             kept[np.array(edit.numbers[1:], int)] = False

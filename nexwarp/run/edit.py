@@ -20,13 +20,13 @@ from nexwarp.model.floaters import find_floaters
 from nexwarp.run.folder import TRAIN, OpenedModel
 
 LEVEL = 0.9  # least height of the normal of a surfel that may be ground
-REACH = 2.0  # of the surfels that may be ground, in distances of the farthest camera from the middle of all
-GROUND = 0.2  # share of the area of such surfels below the cameras that lies below the ground's height
+REACH = 1.5  # of the surfels that may be ground, in distances of the farthest camera from the middle of all
+GROUND = 0.2  # share of such surfels below the cameras that lies below the ground's height
 
 
 @dataclass(frozen=True)
 class EditOrder:
-    """The operation of `nexwarp edit`, one at a time. Positions and lengths are those of the last export."""
+    """The operation of `nexwarp edit`, one at a time. Positions and lengths are in the coordinates of exports."""
 
     crop: Annotated[
         tuple[str, ...] | None, arg(metavar="{box X0 Y0 Z0 X1 Y1 Z1,sphere X Y Z R}", help_behavior_hint="")
@@ -74,11 +74,11 @@ class EditOrder:
         return None if self.origin is None else Edit("origin", self.origin)
 
     def edit(self, opened: OpenedModel, device: torch.device | str, observe: Progress = lambda *_: None) -> Edit | None:
-        """Return the operation on a run, or None; floaters are looked for on `device`, and `observe` told of it."""
+        """Return the operation on a run, None for nothing to do; `device` and `observe` are for --remove-floaters."""
         if self.remove_floaters:
             found = find_floaters(opened.model.to(device), _training_cameras(opened), observe).numpy()
             removed = opened.kept.nonzero()[0][found]
-            return Edit(REMOVE, (checksum(opened.trained.surfels), *removed.tolist()))
+            return Edit(REMOVE, (checksum(opened.trained.surfels), *removed.tolist())) if found.any() else None
         if self.level:
             motion = _levelling(opened)
             return Edit("level", (*motion.rotation.ravel().tolist(), *motion.shift.tolist()))
@@ -94,8 +94,8 @@ def _training_cameras(opened: OpenedModel) -> list[Camera]:
 def _levelling(opened: OpenedModel) -> Similarity:
     """Return the motion from a run's coordinates to levelled ones.
 
-    A fifth of the level surface lies below the ground, of what is below the middle of the cameras and at most twice as
-    far from it as they are.
+    A fifth of the level surfels, by opacity, lies below the ground: of those below the middle of the cameras, and not
+    much farther from it than they are.
     """
     cameras = [opened.frame.camera(camera) for camera in _training_cameras(opened)]
     turn = Similarity(upright(cameras), np.zeros(3))
@@ -106,8 +106,8 @@ def _levelling(opened: OpenedModel) -> Similarity:
     level = near & (np.abs(surfels.normals.detach().numpy()[:, 1]) >= LEVEL) & (means[:, 1] < middle[1])
     level = level if level.any() else np.ones(len(means), bool)
     order = np.argsort(means[level, 1])
-    areas = (surfels.scales.prod(1) * surfels.opacities).detach().double().numpy()[level][order].cumsum()
-    ground = means[level, 1][order][np.searchsorted(areas, GROUND * areas[-1])]
+    weights = surfels.opacities.detach().double().numpy()[level][order].cumsum()
+    ground = means[level, 1][order][np.searchsorted(weights, GROUND * weights[-1])]
     return turn.then(Similarity(np.eye(3), np.array([0.0, -ground, 0.0])))
 
 

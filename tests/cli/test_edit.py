@@ -1,21 +1,27 @@
 """`nexwarp edit`: what it writes, what render, export and view then show, and what it refuses."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from nexwarp.cameras.paths import up_direction
+from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
+from nexwarp.cameras.paths import look_at, up_direction
 from nexwarp.cli import main as cli
 from nexwarp.data.ply import read_vertices
 from nexwarp.export.baked_scene import load_baked
 from nexwarp.model.buffers import load_buffers
 from nexwarp.model.edit import EDIT_FILE
+from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
+from nexwarp.model.surfels import Surfels
 from nexwarp.run.folder import keep_camera_path, open_model
 from tests.cli.support import picture, read, refused, snapshot
+from tests.scenes import rigid
 from tests.tolerances import assert_close
 
 pytestmark = pytest.mark.usefixtures("small_preset")
@@ -56,6 +62,35 @@ def test_a_levelled_and_scaled_run_looks_the_same_from_the_moved_cameras(finishe
         assert_close(new.median_depth, 3.5 * old.median_depth, kind="value", name="depth", allow_flips=0.005)
         assert_close(new.normals, old.normals @ turn.T, kind="gradient", name="normals", allow_flips=0.005)
         assert_close(new.camera.viewmat, opened.frame.camera(old.camera).viewmat, kind="value", name="camera")
+
+
+def test_the_ground_of_a_tilted_scene_becomes_y_0(tmp_path):
+    """Things stand on it, and a few large surfels lie below it."""
+    turn = rigid((0.3, 0.8, -0.4, 0.2), (1, 2, 3))
+    floor = torch.cat([4 * torch.rand(300, 2) - 2, torch.zeros(300, 1)], 1)
+    things = torch.cat([torch.rand(80, 2), 0.2 + torch.rand(80, 1)], 1)
+    below = torch.cat([torch.rand(10, 2), -2 * torch.ones(10, 1)], 1)
+    means = torch.cat([floor, things, below]).double() @ turn[:3, :3].T + turn[:3, 3]
+    quats = torch.tensor([[0.3, 0.8, -0.4, 0.2]]).expand(390, 4)
+    scales = torch.cat([torch.full((380, 2), 0.1), torch.full((10, 2), 3.0)])
+    ones = torch.ones(390)
+    surfels = Surfels.from_activated(
+        means.float(), quats, scales, 0.9 * ones, torch.ones(390, 2), torch.zeros(390, 1, 3)
+    )
+    Model(surfels, None).save(tmp_path)
+    K, up = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]]), torch.tensor([0.0, 0, 1]).double()
+    cameras = {}
+    for number in range(8):
+        angle = number * math.pi / 4
+        place = torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 1.5]).double()
+        viewmat = look_at(place, torch.zeros(3).double(), up) @ torch.linalg.inv(turn)
+        cameras[f"{number}.png"] = Camera(viewmat.float(), K, 40, 30)
+    save_cameras(tmp_path / CAMERAS_FILE, {"train": cameras, "test": {}})
+    edit(tmp_path, "--level")
+    levelled = open_model(tmp_path).frame.points(means.numpy())
+    assert np.allclose(levelled[:300, 1], 0, atol=1e-3) and np.allclose(levelled[380:, 1], -2, atol=1e-3)
+    edit(tmp_path, "--level")
+    assert np.allclose(open_model(tmp_path).frame.points(means.numpy()), levelled, atol=1e-3), "once is enough"
 
 
 def test_exports_are_in_the_new_coordinates_and_hold_what_is_left(finished):

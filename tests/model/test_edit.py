@@ -37,6 +37,7 @@ def test_moved_surfels_look_the_same_to_the_moved_camera(dtype):
         before = nw.render(surfels, None, camera)
         after = nw.render(moved_surfels(surfels, MOTION), None, MOTION.camera(camera))
     assert_close(after.image, before.image, kind="value", name="image")
+    assert MOTION.camera(camera).near == pytest.approx(camera.near * MOTION.scale)
     assert_close(after.median_depth, before.median_depth * MOTION.scale, kind="value", name="depth")
     turn = torch.from_numpy(MOTION.rotation).to(before.normals)
     assert_close(after.normals, before.normals @ turn.T, kind="gradient", name="normals")
@@ -65,6 +66,7 @@ def test_a_crop_keeps_what_lies_inside_in_the_coordinates_before_it():
     centre = np.median(means, axis=0)
     near = np.linalg.norm(means - centre, axis=1) <= 0.8
     edits = [Edit("scale", (2.0,)), Edit("origin", tuple((2 * centre).tolist())), Edit("sphere", (0, 0, 0, 1.6))]
+    assert (kept_surfels(surfels, [*edits, Edit("scale", (9.0,))]) == near).all(), "later edits move what is left"
     kept, frame = kept_surfels(surfels, edits), frame_of(edits)
     assert 0 < near.sum() < 40 and (kept == near).all()
     assert np.allclose(frame.points(means), 2 * (means - centre))
@@ -117,6 +119,14 @@ def test_edits_come_back_from_their_file(tmp_path):
     assert str(edits[0]) == "crop box 0 0 0 1 2 3.5" and str(edits[2]) == "remove 2 floaters"
     write_edits(tmp_path, [])
     assert read_edits(tmp_path) == [] and not (tmp_path / EDIT_FILE).exists()
+
+
+def test_surfels_of_another_model_are_not_removed():
+    surfels = make_surfels(random_scene(5))
+    assert kept_surfels(surfels, [Edit("remove", (checksum(surfels), 4))]).tolist() == [True] * 4 + [False]
+    for numbers in ((checksum(surfels), 5), (checksum(surfels) + 1, 4)):
+        with pytest.raises(ValueError, match="has changed"):
+            kept_surfels(surfels, [Edit("remove", numbers)])
 
 
 @pytest.mark.parametrize(

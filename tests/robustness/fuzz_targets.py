@@ -31,6 +31,7 @@ from nexwarp.export.splats import save_splats_ply
 from nexwarp.export.web.baked import encode_baked
 from nexwarp.io.json_files import write_json
 from nexwarp.io.pictures import load_exr, save_exr
+from nexwarp.model.edit import Edit, checksum, frame_of, kept_surfels, moved_surfels, read_edits, write_edits
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
@@ -203,6 +204,20 @@ def _metrics(folder: Path) -> list[Files]:
     return [_files(folder)]
 
 
+def _edits(folder: Path) -> list[Files]:
+    rotation = (0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    edits = [Edit("box", (-1, -2, -3, 4, 5, 6.5)), Edit("level", (*rotation, 0.0, 1.0, 2.0)), Edit("scale", (2.5,))]
+    write_edits(folder, [*edits, Edit("remove", (checksum(make_model(5).surfels), 1, 2)), Edit("sphere", (0, 0, 0, 9))])
+    return [_files(folder)]
+
+
+def _read_edits(folder: Path) -> None:
+    edits = read_edits(folder)
+    with contextlib.suppress(ValueError):  # nothing is left
+        kept_surfels(make_model(5).surfels, edits)
+    moved_surfels(make_model(5).surfels, frame_of(edits))
+
+
 def _read_cameras(folder: Path) -> None:
     for members in load_cameras(folder / "cameras.json").values():
         for camera in members.values():
@@ -306,6 +321,7 @@ TARGETS = {
         FuzzTarget("cameras", _run_cameras, _read_cameras, (".json",)),
         FuzzTarget("checkpoint", _checkpoint, _read_checkpoint, (".json", ".safetensors")),
         FuzzTarget("metrics", _metrics, read_metrics, (".json",)),
+        FuzzTarget("edits", _edits, _read_edits, (".json",)),
         FuzzTarget("camera_path", _camera_path, _read_camera_path, (".json",)),
         FuzzTarget("ply", _ply, lambda folder: read_ply(folder / "points.ply"), (".ply",)),
         FuzzTarget("masks", _images, _read_images, ("mask",)),
