@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
-import numpy as np
 import torch
 import tyro
 from rich.console import Console
@@ -29,7 +28,7 @@ from nexwarp.model.edit import write_edits
 from nexwarp.model.model import Model
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.run import warmup
-from nexwarp.run.edit import EditOrder, added
+from nexwarp.run.edit import EditOrder, added, described
 from nexwarp.run.evaluate import check_metrics, evaluate
 from nexwarp.run.export import RENDERED, ExportOrder, export_run
 from nexwarp.run.fit_poses import fit_poses
@@ -48,8 +47,6 @@ from nexwarp.train.recipe import MASK_MODES, preset
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
-
-MIDDLE = (0.05, 0.95)  # of the surfels' coordinates, for a user's choice of a crop
 
 
 @dataclass
@@ -301,10 +298,8 @@ class Edit:
                 opened = self._change(opened, device, console)
         for number, edit in enumerate(opened.edits, 1):
             console.print(f"{number}. {edit}")
-        means = opened.frame.points(opened.model.surfels.means.detach().cpu().numpy())
-        low, high = (" ".join(f"{x:.4g}" for x in row) for row in np.quantile(means, MIDDLE, axis=0))
-        what = f"{opened.kept.sum():,} of {len(opened.kept):,} surfels; nine of ten along each axis: {low} to {high}"
-        console.print(what, soft_wrap=True)
+        for line in described(opened):
+            console.print(line, soft_wrap=True)
 
     def _change(self, opened: OpenedModel, device: torch.device, console: Console) -> OpenedModel:
         """Write what the order asks for; return the run as it is then."""

@@ -123,7 +123,7 @@ def _own_texture(record: Mapping[str, Json]) -> Texture:
 
 
 def load(path: str | os.PathLike[str]) -> Model:
-    """Load a model onto the CPU. The scene's photos are not needed.
+    """Load a model onto the CPU, as it was trained: without edits. The scene's photos are not needed.
 
     Args:
         path: a run folder or a model file.

@@ -11,6 +11,7 @@ from tyro.conf import arg
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
+from nexwarp.cameras.paths import focus_ahead
 from nexwarp.cameras.similarity import Similarity, upright
 from nexwarp.errors import RunError, SettingError
 from nexwarp.export.bake import Progress
@@ -19,6 +20,7 @@ from nexwarp.model.edit import REMOVE, Edit, checksum, moved_surfels, write_edit
 from nexwarp.model.floaters import find_floaters
 from nexwarp.run.folder import TRAIN, OpenedModel
 
+MIDDLE = (0.05, 0.95)  # of the surfels' coordinates
 LEVEL = 0.9  # least height of the normal of a surfel that may be ground
 REACH = 1.5  # of the surfels that may be ground, in distances of the farthest camera from the middle of all
 GROUND = 0.2  # share of such surfels below the cameras that lies below the ground's height
@@ -109,6 +111,22 @@ def _levelling(opened: OpenedModel) -> Similarity:
     weights = surfels.opacities.detach().double().numpy()[level][order].cumsum()
     ground = means[level, 1][order][np.searchsorted(weights, GROUND * weights[-1])]
     return turn.then(Similarity(np.eye(3), np.array([0.0, -ground, 0.0])))
+
+
+def described(opened: OpenedModel) -> list[str]:
+    """Return lines that say how many surfels of a run are left, and where they and its subject are, for a crop."""
+    means = opened.frame.points(opened.model.surfels.means.detach().cpu().numpy())
+    low, high = (" ".join(f"{x:.4g}" for x in row) for row in np.quantile(means, MIDDLE, axis=0))
+    count = f"{opened.kept.sum():,} of {len(opened.kept):,} surfels"
+    lines = [f"{count}; nine of ten along each axis: {low} to {high}"]
+    has_cameras = opened.source is None or (opened.folder / CAMERAS_FILE).is_file()
+    cameras = [opened.frame.camera(x) for x in opened.cameras.get(TRAIN, {}).values()] if has_cameras else []
+    target, share = focus_ahead(cameras)
+    if share == 1:
+        places = torch.stack([camera.position.double() for camera in cameras])
+        at = " ".join(f"{x:.4g}" for x in target.tolist())
+        lines.append(f"the cameras look at {at}, from {(places - target).norm(dim=1).quantile(0.5):.4g} away")
+    return lines
 
 
 def added(opened: OpenedModel, edit: Edit) -> OpenedModel:

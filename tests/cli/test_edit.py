@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
-from nexwarp.cameras.paths import look_at, up_direction
+from nexwarp.cameras.paths import focus, look_at, up_direction
 from nexwarp.cli import main as cli
 from nexwarp.data.ply import read_vertices
 from nexwarp.export.baked_scene import load_baked
@@ -93,6 +94,16 @@ def test_the_ground_of_a_tilted_scene_becomes_y_0(tmp_path):
     assert np.allclose(open_model(tmp_path).frame.points(means.numpy()), levelled, atol=1e-3), "once is enough"
 
 
+def test_the_list_says_where_the_subject_is(trained, capsys):
+    edit(trained)
+    surfels, subject = capsys.readouterr().out.splitlines()
+    cameras = [*open_model(trained).cameras["train"].values()]
+    expected = focus(cameras)
+    numbers = [float(x) for x in re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", subject)]
+    away = np.median([(camera.position - expected).norm().item() for camera in cameras])
+    assert np.allclose(numbers, [*expected.tolist(), away], rtol=1e-3, atol=1e-3) and "surfels" in surfels
+
+
 def test_exports_are_in_the_new_coordinates_and_hold_what_is_left(finished):
     assert cli.main(["export", str(finished)]) == 0
     before = centres(finished)
@@ -123,7 +134,7 @@ def test_undo_gives_the_same_bits_and_evaluation_never_sees_edits(finished, caps
     metrics = read(finished, "metrics.json")
     capsys.readouterr()
     edit(finished)
-    out = capsys.readouterr().out.splitlines()
+    out = [line for line in capsys.readouterr().out.splitlines() if not line.startswith("the cameras look at")]
     assert [line[:8] for line in out[:4]] == ["1. crop ", "2. level", "3. scale", "4. origi"] and len(out) == 5
     assert cli.main(["info", str(finished)]) == 0
     assert "crop sphere 0 0 0 1.5" in capsys.readouterr().out
