@@ -33,6 +33,7 @@ class Photo:
     viewmat: np.ndarray  # (4, 4) float64, world to camera, OpenCV axes; a capture's "world" has its `origin`
     lens: Lens  # the size of the image file may differ from the lens's by a factor
     mask: Path | None = None  # None if the scene names none
+    depth: Path | None = None  # its depth map; None if it has none
     face: str | None = None  # of a panorama, a key of `nexwarp.data.lens.FACES`; None for other photos
     points: np.ndarray | None = None  # (M, 3) float32 world positions that were triangulated from it; None if unknown
 
@@ -168,6 +169,15 @@ def find_file(folder: Path, name: str) -> Path:
     return path
 
 
+def find_named(folder: Path, name: str, appended: Sequence[str], replaced: Sequence[str] = ()) -> Path | None:
+    """Find the file of a photo in a folder: its name with a suffix appended, or its stem with another one, or None."""
+    path = PurePosixPath(name)
+    candidates = [path.with_name(path.name + suffix) for suffix in appended]
+    candidates += [path.with_suffix(suffix) for suffix in replaced]
+    files = (find_file(folder, str(candidate)) for candidate in candidates)
+    return next((file for file in files if file.is_file()), None)
+
+
 def inside_folder(where: str, path: Path, folder: Path, follow_links: bool) -> Path:
     """Return a path below `folder`, which may be a link itself; ValueError if a link leads out and may not."""
     if follow_links:
@@ -186,7 +196,7 @@ def report_missing(source: Path, names: Sequence[str], count: int, skip: bool) -
     """Raise FileNotFoundError naming the photos of `count` that do not exist; with `skip` warn, if two are left."""
     if not names:
         return
-    absent = f"{source}: {len(names)} of {count} photos: image not found: {_listed(names, MOST_NAMED)}"
+    absent = f"{source}: {len(names)} of {count} photos: image not found: {listed(names, MOST_NAMED)}"
     if not skip or count - len(names) < 2:
         raise FileNotFoundError(absent if skip else f"{absent}; --skip-missing goes on without them")
     warnings.warn(f"{absent}; going on without them", stacklevel=2)
@@ -201,7 +211,7 @@ def report_unused(source: Path, folder: Path, photos: Iterable[Photo]) -> None:
     if unused and len(pictures) - len(unused) > 1:  # fewer photos are an error
         warnings.warn(
             f"{folder}: {len(unused)} of {len(pictures)} photos are not used, as {source} does not list them: "
-            f"{one_line(_listed(unused, 8), 400)}",
+            f"{one_line(listed(unused, 8), 400)}",
             stacklevel=2,
         )
 
@@ -211,7 +221,8 @@ def plain_name(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-def _listed(names: Sequence[str], most: int) -> str:
+def listed(names: Sequence[str], most: int) -> str:
+    """The first names of many, for messages."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" * (len(names) > most))
 
 

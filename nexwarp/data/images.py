@@ -237,6 +237,14 @@ def read_mask(path: Path) -> torch.Tensor:
     return torch.from_numpy(used if used.any() else values > 0)
 
 
+def read_grey(path: Path) -> np.ndarray:
+    """Read the numbers (H, W) float32 of a grey image, 0 to 255 or 65535; FormatError for another, else as above."""
+    with _loaded(path) as image:
+        if image.mode != "L" and not image.mode.startswith("I"):
+            raise FormatError(f"{path}: expected one channel of 8 or 16 bits, got the mode {image.mode}")
+        return np.asarray(image).astype(np.float32)
+
+
 def _mask_values(image: "PIL.Image.Image") -> np.ndarray:
     """Return the values (H, W) that decide which pixels of a mask are used."""
     if image.mode == "1":
@@ -300,11 +308,11 @@ def downscale_mask(mask: torch.Tensor, factor: int) -> torch.Tensor:
     return blocks.all(dim=3).all(dim=1)
 
 
-def resize_mask(mask: torch.Tensor, width: int, height: int) -> torch.Tensor:
-    """Resample a mask (H, W) bool to (height, width) by nearest neighbours."""
-    rows = ((torch.arange(height) + 0.5) * (mask.shape[0] / height)).long()
-    columns = ((torch.arange(width) + 0.5) * (mask.shape[1] / width)).long()
-    return mask[rows][:, columns]
+def resize_nearest(values: torch.Tensor, width: int, height: int) -> torch.Tensor:
+    """Resample values (H, W) to (height, width) by nearest neighbours."""
+    rows = ((torch.arange(height) + 0.5) * (values.shape[0] / height)).long()
+    columns = ((torch.arange(width) + 0.5) * (values.shape[1] / width)).long()
+    return values[rows][:, columns]
 
 
 def downscale_image(image: torch.Tensor, factor: int) -> torch.Tensor:

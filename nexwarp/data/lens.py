@@ -230,13 +230,14 @@ class Map:
 
     def mask(self, mask: torch.Tensor | None) -> torch.Tensor | None:
         """Resample a mask (H, W) bool to (h, w) bool, False outside the photo; None if all pixels are True."""
-        if mask is None:
-            return self.valid
+        return self.valid if mask is None else self.nearest(mask.float()) > 0.5
+
+    def nearest(self, values: torch.Tensor) -> torch.Tensor:
+        """Resample values (H, W) float to (h, w) by nearest neighbours, 0 outside the photo; theirs may be any size."""
         near = torch.nn.functional.grid_sample(
-            mask[None, None].float(), self.grid, mode="nearest", padding_mode="border", align_corners=False
-        )
-        out = near[0, 0] > 0.5
-        return out if self.valid is None else out & self.valid
+            values[None, None], self.grid, mode="nearest", padding_mode="border", align_corners=False
+        )[0, 0]
+        return near if self.valid is None else near * self.valid
 
 
 @lru_cache(maxsize=256)

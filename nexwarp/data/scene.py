@@ -30,6 +30,8 @@ from nexwarp.data.capture import (
     short,
 )
 from nexwarp.data.colmap import has_model, read_model
+from nexwarp.data.depth_files import with_depths
+from nexwarp.data.depth_fit import fit_depths
 from nexwarp.data.images import quiet_pillow
 from nexwarp.data.in_memory import as_bytes, make_cloud, near_origin, split_views
 from nexwarp.data.ply import read_ply
@@ -54,6 +56,7 @@ MASKS, ALPHA, NONE = "masks", "alpha", "none"
 RANDOM = "random"
 # Host memory that reading takes while it goes on, in bytes a pixel of the photo as it lies in its file.
 READ_BYTES, UNDISTORT_BYTES = 24, 64
+DEPTH_BYTES = 2  # a pixel of a depth map
 MAX_READERS = 32
 GIB = 2**30
 SHARE = 0.9  # largest share of the free memory for photos
@@ -358,6 +361,7 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | No
         scale = _scene_scale(str(capture.source), viewmats, cloud)
         background = capture.background if color is None else color
         train, held_out = _read_views(source, path, capture, tests, background, NEAR_FRACTION * scale, progress)
+        train = fit_depths(train, cloud, path)
         if color is None and all(view.alpha is None for view in train + held_out):
             background = None  # behind opaque photos there is none to see
         scene = _make_scene(train, held_out, cloud, scale, path, background)
@@ -419,9 +423,12 @@ def _read_views(
     """Read all photos; return the training views and the test views."""
     alpha_mask = source.masks == ALPHA
     reader = ViewReader(source.downscale, background, alpha_mask)
-    plans = _map(reader.plan, _with_masks(path, capture.photos, source.masks), MAX_READERS)
+    photos = with_depths(path, _with_masks(path, capture.photos, source.masks))
+    photos = [dataclasses.replace(x, depth=None) if test else x for x, test in zip(photos, tests, strict=True)]
+    plans = _map(reader.plan, photos, MAX_READERS)
     jobs = [job for plan in plans for job in plan]
     channels = 3 + (background is not None) + (alpha_mask or any(job.photo.mask for job in jobs))
+    channels += DEPTH_BYTES * any(job.photo.depth for job in jobs)
     workers = _workers(source, path, channels, jobs)
     x, y, z = capture.origin.tolist()
     views = _map(lambda job: reader.read(job, near, (x, y, z)), jobs, workers, progress)

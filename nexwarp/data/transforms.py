@@ -41,7 +41,7 @@ EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 WHITE = (1.0, 1.0, 1.0)
 FILE_KEYS = {"frames", "test_frames", "applied_transform", "applied_scale", "ply_file_path"}
 FILE_KEYS |= {"train_filenames", "val_filenames", "test_filenames"}
-FRAME_KEYS = {"file_path", "transform_matrix", "mask_path"}
+FRAME_KEYS = {"file_path", "transform_matrix", "mask_path", "depth_file_path"}
 # Of other programs' own scaling and bookkeeping: without them the scene is the same.
 HARMLESS = {"aabb", "aabb_scale", "scale", "offset", "up", "sharpness", "rotation", "colmap_im_id"}
 AGREEMENT = 2.0  # ratio of colour errors from which points count as being in the original world
@@ -167,15 +167,20 @@ def _name_unread(file: Path, data: JsonObject, entries: list[JsonObject]) -> Non
 
 
 def _photo(where: str, frames: _Frames, entry: JsonObject, name: str, file: Path) -> Photo:
-    mask = None
-    if entry.get("mask_path") is not None:
-        folder = frames.file.parent
-        mask = find_file(folder, _file_name(where, "mask_path", entry["mask_path"], folder))
-        if not mask.is_file():
-            raise FileNotFoundError(f"{where}: mask not found: {mask}")
-        inside_folder(f"{where}: mask_path", mask, folder, frames.follow_links)
+    mask, depth = (_named_file(where, frames, entry, key) for key in ("mask_path", "depth_file_path"))
     lens = _frame_lens(where, entry, frames.data, file)
-    return Photo(name, file, _frame_viewmat(where, entry, frames.to_original), lens, mask)
+    return Photo(name, file, _frame_viewmat(where, entry, frames.to_original), lens, mask, depth)
+
+
+def _named_file(where: str, frames: _Frames, entry: JsonObject, key: str) -> Path | None:
+    """The file that a key of a frame names, in the scene's folder; None without the key."""
+    if entry.get(key) is None:
+        return None
+    folder, what = frames.file.parent, "mask" if key == "mask_path" else "depth map"
+    path = find_file(folder, _file_name(where, key, entry[key], folder))
+    if not path.is_file():
+        raise FileNotFoundError(f"{where}: {what} not found: {path}")
+    return inside_folder(f"{where}: {key}", path, folder, frames.follow_links)
 
 
 def _file_name(where: str, key: str, value: Json, folder: Path) -> str:

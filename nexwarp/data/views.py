@@ -12,7 +12,8 @@ import torch
 from torch.utils.data._utils.collate import collate, default_collate_fn_map
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.data.capture import Photo, find_file
+from nexwarp.data.capture import Photo, find_named
+from nexwarp.data.depth_files import read_depth
 from nexwarp.data.images import (
     compose,
     downscale_image,
@@ -21,9 +22,9 @@ from nexwarp.data.images import (
     read_image,
     read_mask,
     read_transparent,
-    resize_mask,
+    resize_nearest,
 )
-from nexwarp.data.lens import FACES, PANORAMA, Intrinsics, Lens, undistortion
+from nexwarp.data.lens import FACES, PANORAMA, Intrinsics, Lens, Map, undistortion
 from nexwarp.io.files import one_line
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
@@ -31,6 +32,7 @@ OPAQUE = 255
 # A larger side than this ratio times the camera's is refused before decoding, since tiny files can hold huge images.
 MAX_ENLARGED, SMALL = 16, 1024
 KEPT_MAPS = 6  # for the faces of a panorama
+SHAPE_TOLERANCE = 0.02  # of the ratio of a depth map's sides: networks have sides that are multiples of 14, say
 HALF = 128  # smallest alpha of a used pixel, with alpha as the mask
 
 undistorted = lru_cache(maxsize=4096)(Lens.undistorted)
@@ -50,6 +52,7 @@ class View:
             image + (1 - alpha / 255) (B - background), in sRGB.
         points: (M, 3) float32 world positions of the sparse points that were triangulated from the photo; None if
             unknown. Points of an undistorted photo may project outside the image.
+        depth: (H, W) float16 z-depths of a training photo's depth map, world units, 0 where unknown; None without.
     """
 
     camera: Camera
@@ -58,6 +61,7 @@ class View:
     name: str
     alpha: torch.Tensor | None = None
     points: torch.Tensor | None = None
+    depth: torch.Tensor | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a batch of a torch `DataLoader` is made of, which is how views collate.
@@ -134,6 +138,7 @@ class ViewReader:
         """Read, undistort and reduce a photo; `near` and `origin` are those of its camera."""
         photo = plan.photo
         image, alpha, mask = self._pixels(plan)
+        depth = None if photo.depth is None else self._depth(plan, photo.depth)
         if mask is not None and mask.all():
             mask = None
         if mask is not None and not mask.any():
@@ -147,7 +152,7 @@ class ViewReader:
         except ValueError as error:
             raise ValueError(f"{photo.file}: the camera of this image is not usable: {error}") from error
         points = None if photo.points is None else torch.from_numpy(photo.points)
-        return View(camera, image, mask, photo.name, alpha, points)
+        return View(camera, image, mask, photo.name, alpha, points, depth)
 
     def _pixels(self, plan: PlannedView) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
         """Read image, alpha and mask, undistort and reduce them."""
@@ -162,14 +167,36 @@ class ViewReader:
         elif alpha is not None:
             image = compose(image, alpha, self.background)
         if photo.lens.distorted:
-            with self._lock:  # photos that share a lens wait for its map
-                undistort = self._maps(photo.lens, plan.target, photo.face)
+            undistort = self._map(plan)
             image, mask = undistort.colors(image), undistort.mask(mask)
             alpha = undistort.colors(alpha[:, :, None])[:, :, 0] if alpha is not None else None
         image = downscale_image(image, self.downscale)
         mask = downscale_mask(mask, self.downscale) if mask is not None else None
         alpha = downscale_image(alpha[:, :, None], self.downscale)[:, :, 0] if alpha is not None else None
         return image, alpha, mask
+
+    def _map(self, plan: PlannedView) -> Map:
+        with self._lock:  # photos that share a lens wait for its map
+            return self._maps(plan.photo.lens, plan.target, plan.photo.face)
+
+    def _depth(self, plan: PlannedView, file: Path) -> torch.Tensor:
+        """Read a depth map and resample it to the view by nearest neighbours: means would lie between two surfaces."""
+        if plan.photo.face is not None:
+            raise ValueError(f"{file}: expected no depth map of a panorama, which cannot be used")
+        values, (width, height) = read_depth(file), plan.size
+        rows, columns = values.shape
+        if abs(columns * height - rows * width) > SHAPE_TOLERANCE * columns * height:
+            raise ValueError(
+                f"{file}: expected a depth map of {width}x{height} pixels as {plan.photo.file.name} has, or that shape "
+                f"at another size, got {columns}x{rows}"
+            )
+        if plan.photo.lens.distorted:
+            values = self._map(plan).nearest(values.float()).half()
+        else:
+            values = resize_nearest(values, width, height)
+        step, (height, width) = self.downscale, values.shape
+        middle = slice(step // 2, None, step)
+        return values[middle, middle][: height // step, : width // step].contiguous()
 
 
 def _face(photo: Photo, face: str) -> Photo:
@@ -182,10 +209,7 @@ def _face(photo: Photo, face: str) -> Photo:
 
 def find_mask(folder: Path, name: str) -> Path | None:
     """Find the mask of a photo in a folder: its name with ".png" appended, or its stem with another suffix, or None."""
-    path = PurePosixPath(name)
-    candidates = [path.with_name(f"{path.name}.png"), *(path.with_suffix(suffix) for suffix in MASK_SUFFIXES)]
-    files = (find_file(folder, str(candidate)) for candidate in candidates)
-    return next((file for file in files if file.is_file()), None)
+    return find_named(folder, name, (".png",), MASK_SUFFIXES)
 
 
 def _mask(photo: Photo, image: torch.Tensor, alpha: torch.Tensor | None) -> torch.Tensor | None:
@@ -196,7 +220,7 @@ def _mask(photo: Photo, image: torch.Tensor, alpha: torch.Tensor | None) -> torc
         return None
     height, width = image.shape[:2]
     mask = read_mask(photo.mask)
-    return mask if mask.shape == (height, width) else resize_mask(mask, width, height)
+    return mask if mask.shape == (height, width) else resize_nearest(mask, width, height)
 
 
 def _check_mask(photo: Photo, mask: Path, size: tuple[int, int]) -> None:

@@ -118,6 +118,21 @@ def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dic
     return tensors, metadata
 
 
+def load_exr_channel(path: Path) -> np.ndarray:
+    """Read the only channel (H, W) of an OpenEXR file as float32; FormatError if it has more, or is damaged."""
+    import OpenEXR
+
+    try:
+        _check_size(path)
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            planes = [channel.pixels for part in file.parts for channel in part.channels.values()]
+    except Exception as error:  # OpenEXR raises RuntimeError and other types
+        raise FormatError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({one_line(error)})") from None
+    if len(planes) != 1:
+        raise FormatError(f"{path}: expected one channel, got {len(planes)}")
+    return np.asarray(planes[0], np.float32)
+
+
 def _tensor(channels: Mapping[str, np.ndarray]) -> torch.Tensor:
     """Return (H, W, 3) values of the channels R, G, B, or (H, W) of Y."""
     names = [name for name in "RGBY" if name in channels]

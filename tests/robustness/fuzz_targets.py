@@ -20,6 +20,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.data import load_scene
+from nexwarp.data.depth_files import read_depth
 from nexwarp.data.images import MAKE, MODEL, read_image, read_mask, read_transparent
 from nexwarp.data.ply import read_ply
 from nexwarp.data.scene import SceneSource
@@ -309,6 +310,22 @@ def _exr(folder: Path) -> list[Files]:
     return [_files(folder / "a"), _files(folder / "b")]
 
 
+def _depths(folder: Path) -> list[Files]:
+    folder.mkdir(parents=True, exist_ok=True)
+    values = 1 + np.random.default_rng(0).random((HEIGHT, WIDTH), np.float32)
+    Image.fromarray((1000 * values).astype(np.uint16)).save(folder / "a.png")
+    np.save(folder / "a.npy", values)
+    save_exr(folder / "a.exr", {"depth": torch.from_numpy(values)})
+    (folder / "a.bin").write_bytes(f"{WIDTH}&{HEIGHT}&1&".encode() + values.tobytes())
+    return [{name: data} for name, data in _files(folder).items()]
+
+
+def _read_depths(folder: Path) -> None:
+    (file,) = folder.iterdir()
+    depth = read_depth(file)
+    assert bool(torch.isfinite(depth).all()) and bool((depth >= 0).all())
+
+
 TARGETS = {
     target.name: target
     for target in (
@@ -332,6 +349,7 @@ TARGETS = {
             (".jpg",),
         ),
         FuzzTarget("baked", _baked, _read_baked, (".nxb", ".glb")),
+        FuzzTarget("depths", _depths, _read_depths, (".png", ".npy", ".exr", ".bin")),
         FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
     )
 }
