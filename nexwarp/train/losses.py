@@ -26,7 +26,20 @@ OwnLoss = Callable[[Rendering, Target], torch.Tensor]
 SATURATION = 250 / 255
 # Factor of the squared pose corrections, which keeps poses near the given ones.
 POSE_PRIOR = 0.1
-BUILT_IN = ("l1", "dssim", "texture", "alpha", "opacity", "grid", "empty", "depth", "normals", "poses", "regulariser")
+BUILT_IN = (
+    "l1",
+    "dssim",
+    "texture",
+    "alpha",
+    "opacity",
+    "grid",
+    "empty",
+    "depth",
+    "depth_maps",
+    "normals",
+    "poses",
+    "regulariser",
+)
 ALPHA_HITS = 2  # of a pixel's hits, the heaviest ones whose weights the alpha term counts
 
 
@@ -111,7 +124,18 @@ def depth_loss(
     """
     # Not by two indices: on a CPU that adds its gradients, where there are many, by atomics in any order.
     shares, reached = (x.flatten(0, 1).index_select(0, places) for x in (weights, depths))
-    means = (shares * reached).sum(-1) / (shares.sum(-1) + WEIGHT_EPSILON)
+    return depth_map_loss(reached, shares, expected)
+
+
+def depth_map_loss(depths: torch.Tensor, weights: torch.Tensor, expected: torch.Tensor) -> torch.Tensor:
+    """Mean over pixels of |mean depth of their hits / expected depth - 1|: no error has a larger gradient than another.
+
+    Args:
+        depths: (..., K) z-depths of the textured hits, world units.
+        weights: (..., K), W.
+        expected: (...) z-depths, world units; 0 where unknown, which does not count. 0 without any.
+    """
+    means = (weights * depths).sum(-1) / (weights.sum(-1) + WEIGHT_EPSILON)
     known = expected > 0
     errors = (means / torch.where(known, expected, 1) - 1).abs() * known
     return errors.sum() / known.sum().clamp_min(1)
@@ -212,6 +236,8 @@ def step_losses(
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:
         losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, target.places, target.expected)
+    if target.depth is not None:
+        losses["depth_maps"] = factors.depth_maps * depth_map_loss(out.depths, out.weights, target.depth)
     if target.normals > 0:
         losses["normals"] = target.normals * normal_loss(out, target.counts)
     if state.poses is not None and target.view is not None:

@@ -83,6 +83,8 @@ class LossWeights:
     """Factor of the opacity in pixels that a mask declares as background."""
     depth: float = 0.3
     """Factor of the relative depth error at the points that were triangulated from the photo."""
+    depth_maps: float = 1.0
+    """Factor of the relative depth error where photos have depth maps."""
     normals: float = 0.0
     """Factor of the normal consistency of 2DGS: the difference between the surfels' normals and those of the depth map.
     Counts from 7/30 of the run on; smoother meshes."""
@@ -90,7 +92,7 @@ class LossWeights:
     def __post_init__(self) -> None:
         _check_types(self)
         check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "normals"):
+        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "depth_maps", "normals"):
             check_range(name, getattr(self, name), 0.0)
 
 
@@ -334,7 +336,7 @@ PAPER = Config(
     texture=TextureConfig(
         levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
     ),
-    losses=LossWeights(depth=0.0),
+    losses=LossWeights(depth=0.0, depth_maps=0.0),
     densify=DensifyConfig(prune_at_cap=False, relocate=0.0),
 )
 

@@ -267,7 +267,7 @@ def check_origin(origin: Mapping[str, str], config: Config, state: Mapping[str, 
     if state["views"] != origin["views"]:
         raise ValueError("it has seen other training views than the scene has")
     if state["scene"] != origin["scene"]:
-        raise ValueError("the scene's photos, masks or points have changed since")
+        raise ValueError("the scene's photos, masks, depth maps or points have changed since")
     if state.get("teachers", "") != origin.get("teachers", ""):
         raise ValueError("it has learned from other teachers, from others besides, or in another order")
 
@@ -300,11 +300,11 @@ def check_generator(name: str, state: torch.Tensor) -> None:
 
 
 def scene_digest(scene: Scene, texture: Texture) -> str:
-    """Return a digest of what training takes from a scene beside its cameras: photos, masks, points, scale."""
+    """Return a digest of what training takes from a scene beside its cameras: photos, masks, points, depths, scale."""
     kind = texture.config if type(texture) is NeuralTexture else type(texture).__qualname__
     digest = hashlib.sha256(f"{scene.scale} {kind}".encode())
     for view in scene.train:
-        for values in (view.image, view.mask, view.alpha, view.points):
+        for values in (view.image, view.mask, view.alpha, view.points, view.depth):
             if values is not None:  # CRC: photos are many, and nobody forges them
                 digest.update(zlib.crc32(values.contiguous().numpy().data).to_bytes(4, "little"))
     for values in (scene.points, scene.colors):

@@ -52,6 +52,7 @@ class Target:
         empty: (H, W) bool, where there is nothing but the background; None is nowhere.
         places: (M,) int64, row * W + column of the points whose depths are compared; None is no such loss.
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
+        depth: (H, W) z-depths of the photo's depth map, world units, 0 where there is none; None is no such loss.
         depth_jitter: (H, W, K), the `jitter` of `nexwarp.model.render.draw`; None is none.
         view: (1,) int64, index of the training view; None where poses are not learned.
         normals: factor of the normal loss in this step.
@@ -65,6 +66,7 @@ class Target:
     empty: torch.Tensor | None = None
     places: torch.Tensor | None = None
     expected: torch.Tensor | None = None
+    depth: torch.Tensor | None = None
     depth_jitter: torch.Tensor | None = None
     view: torch.Tensor | None = None
     normals: float = 0.0
@@ -111,7 +113,7 @@ class TargetSource:
     def make(self, index: int, number: int, upcoming: list[int]) -> Target:
         """Make the target of a step with view `index`, number `number` of the training, before the `upcoming` ones."""
         config, iteration = self.config, self.state.iteration
-        target = self.with_points(self.from_view(index, upcoming), index)
+        target = self.with_depth(self.with_points(self.from_view(index, upcoming), index), index)
         target = dataclasses.replace(target, normals=config.normals_at(iteration))
         if config.depth_jitter > 0 and config.max_hits:
             hits = config.hits_at(iteration)
@@ -158,6 +160,15 @@ class TargetSource:
         fill = self._most_points - len(places) if device.type == "cuda" else 0
         places, expected = (torch.nn.functional.pad(x, (0, fill)) for x in (places, expected))
         return dataclasses.replace(target, places=places, expected=expected)
+
+    def with_depth(self, target: Target, index: int) -> Target:
+        """Add the depth map of view `index` to its target, where photos have any and their loss counts."""
+        counted = self.config.losses.depth_maps > 0 and self.config.max_hits > 0
+        depth = self.views.depth(index) if counted else None
+        if depth is None:
+            return target
+        mask = target.counts if target.empty is None else ~target.empty
+        return dataclasses.replace(target, depth=depth if mask is None else depth * mask)
 
     @cached_property
     def _most_points(self) -> int:
@@ -227,10 +238,11 @@ class TaughtTargets(TargetSource):
             picture = teacher.render_image(camera, background=of_photo.background, exposure="mean")
         # Gains of 1, and depths of 0, which stand for no point: without masks, steps with photos have the same graph.
         exposure = None if of_photo.exposure is None else torch.ones_like(of_photo.exposure)
-        depths = None if of_photo.expected is None else torch.zeros_like(of_photo.expected)
-        return dataclasses.replace(
-            of_photo, camera=camera, photo=picture, exposure=exposure, expected=depths, counts=None, empty=None
+        expected, depth = (None if x is None else torch.zeros_like(x) for x in (of_photo.expected, of_photo.depth))
+        target = dataclasses.replace(
+            of_photo, exposure=exposure, expected=expected, depth=depth, counts=None, empty=None
         )
+        return dataclasses.replace(target, camera=camera, photo=picture)
 
 
 def teachers_digest(teachers: Iterable[Model]) -> str:
@@ -283,12 +295,15 @@ class TrainingViews:
         self.views = views
         self.cameras = [view.camera.to(device) for view in views]
         self.photos = [view.image for view in views]
+        self.depths = [view.depth for view in views]
+        self.has_depths = any(depth is not None for depth in self.depths)
         self.pool: ThreadPoolExecutor | None = None
         self.coming: dict[int, Future[tuple[torch.Tensor, torch.cuda.Event]]] = {}
         if device.type == "cuda":
             free, _ = torch.cuda.mem_get_info(device)
-            if sum(p.numel() for p in self.photos) < PHOTO_SHARE * free:
+            if sum(x.nbytes for x in (*self.photos, *self.depths) if x is not None) < PHOTO_SHARE * free:
                 self.photos = [p.to(device) for p in self.photos]
+                self.depths = [None if depth is None else depth.to(device) for depth in self.depths]
             else:
                 self.pool = ThreadPoolExecutor(1, "photos")
                 self.stream = torch.cuda.Stream(device)
@@ -338,6 +353,15 @@ class TrainingViews:
         """Return alpha (H, W) float in [0, 1] of a photo; None if it is opaque."""
         alpha = self.views[index].alpha
         return None if alpha is None else alpha.to(self.device, non_blocking=True).float() / 255.0
+
+    def depth(self, index: int) -> torch.Tensor | None:
+        """Return the depths (H, W) float of a photo, 0 where unknown; None if no photo has any."""
+        if not self.has_depths:
+            return None
+        depth, camera = self.depths[index], self.cameras[index]
+        if depth is None:  # zeros: one CUDA graph serves all photos
+            return torch.zeros(camera.height, camera.width, device=self.device)
+        return depth.to(self.device, non_blocking=True).float()
 
     def _on_device(self, index: int) -> torch.Tensor:
         coming = self.coming.pop(index, None)

@@ -181,6 +181,24 @@ def test_what_fills_up_points_does_not_count() -> None:
     assert none.item() == 0 and not any(x.any() for x in torch.autograd.grad(none, [depths, weights]))
 
 
+def test_the_loss_of_a_depth_map_is_that_of_points_in_all_pixels() -> None:
+    """By hand for one pixel, by points for the rest, by finite differences for the gradients; unknown ones are out."""
+    depths = (2 + torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
+    weights = (0.1 + 0.4 * torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
+    expected = 1.5 + 3 * torch.rand(3, 4, dtype=torch.float64)
+    one = losses.depth_map_loss(torch.tensor([2.0, 4.0]), torch.tensor([0.3, 0.1]), torch.tensor(2.0))
+    assert one.item() == pytest.approx(0.25, abs=1e-5)
+    expected[1, :2] = 0
+    known = expected.flatten().nonzero()[:, 0]
+    loss = losses.depth_map_loss(depths, weights, expected)
+    points = losses.depth_loss(depths, weights, known, expected.flatten()[known])
+    assert_close(loss, points, kind="value", name="loss")
+    assert gradcheck(lambda d, w: losses.depth_map_loss(d, w, expected), [depths, weights])
+    for gradient in torch.autograd.grad(loss, [depths, weights]):
+        assert not gradient[1, :2].any() and gradient[expected > 0].any()
+    assert losses.depth_map_loss(depths, weights, torch.zeros(3, 4)).item() == 0
+
+
 def test_depth_loss_against_finite_differences() -> None:
     depths = (2 + torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
     weights = (0.1 + 0.4 * torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()

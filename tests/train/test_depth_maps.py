@@ -1,0 +1,128 @@
+"""Depth maps in training: the bits of a training without them, one kind of step for all photos, and any scale."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.data import Scene, View
+from nexwarp.model.graphs import _kind
+from nexwarp.train.parallel import ParallelTrainer
+from nexwarp.train.ranks.ranks import Ranks
+from nexwarp.train.recipe import LossWeights
+from nexwarp.train.target import TrainingViews
+from nexwarp.train.trainer import Trainer
+from tests.narrowing import present
+from tests.ranks_support import CPU, digest, run_ranks
+from tests.tolerances import assert_close
+from tests.trainer_support import assert_resumed_alike, assert_same_state, small, trained
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+OFF = LossWeights(depth_maps=0.0)
+
+
+def at(view: View, depth: float) -> View:
+    return dataclasses.replace(view, depth=torch.full(view.image.shape[:2], depth).half())
+
+
+@pytest.fixture
+def mapped(scene: Scene) -> Scene:
+    """A scene whose photos have maps, but for one."""
+    return dataclasses.replace(scene, train=[scene.train[0], *(at(view, 3.0) for view in scene.train[1:])])
+
+
+def test_without_maps_the_loss_changes_no_bit(scene: Scene, mapped: Scene) -> None:
+    plain = trained(scene, small(losses=OFF))
+    assert_same_state(trained(scene, small()), plain)
+    assert_same_state(trained(mapped, small(losses=OFF)), plain)
+    trainer = Trainer(scene, small(), "cpu")
+    assert trainer.targets.make(0, 1, []).depth is None and "depth_maps" not in trainer.step().losses
+
+
+def test_photos_without_a_map_have_the_same_kind_of_step(mapped: Scene) -> None:
+    """So that one CUDA graph serves all, those with a teacher's picture too: zeros, which count nowhere."""
+    trainer = Trainer(mapped, small(losses=LossWeights(depth=0.0)), "cpu")
+    bare, full = (trainer.targets.make(index, 1, []) for index in (0, 1))
+    assert _kind(bare) == _kind(full)
+    assert not present(bare.depth).any() and bool((present(full.depth) == 3).all())
+    teacher = trained(mapped, small(seed=1)).finish()
+    student = Trainer(mapped, small(losses=LossWeights(depth=0.0)), "cpu", teachers=[teacher])
+    taught = student.targets.make(1, 2, [])
+    assert _kind(taught) == _kind(full) and not present(taught.depth).any()
+
+
+@pytest.mark.parametrize("mode", ["ignore", "background"])
+def test_masked_pixels_have_no_depth(mapped: Scene, mode: str) -> None:
+    view = mapped.train[1]
+    mask = torch.rand(view.image.shape[:2]) < 0.5
+    scene = dataclasses.replace(mapped, train=[dataclasses.replace(view, mask=mask), *mapped.train[2:]])
+    trainer = Trainer(scene, small(mask_mode=mode), "cpu")
+    depth = trainer.targets.make(0, 1, []).depth
+    assert torch.equal(present(depth), 3.0 * mask)
+
+
+def test_maps_draw_the_surfels(mapped: Scene) -> None:
+    """Half as deep as the scene is: their error falls, and without the loss it does not."""
+    scene = dataclasses.replace(mapped, train=[at(view, 1.5) for view in mapped.train])
+
+    def error(losses: LossWeights) -> float:
+        trainer = trained(scene, small(iterations=60, losses=losses, exposures=False))
+        with torch.no_grad():
+            depths = [trainer.model().render(view.camera).expected_depth for view in scene.train]
+        return float(np.mean([(depth / 1.5 - 1).abs().mean().item() for depth in depths]))
+
+    assert error(LossWeights(depth=0.0, depth_maps=3.0)) < 0.9 * error(LossWeights(depth=0.0, depth_maps=0.0))
+
+
+def test_a_wrong_scale_gives_the_same_targets(tiny_folder: Path, tmp_path: Path) -> None:
+    targets = []
+    for factor in (1.0, 3.7):
+        folder = tmp_path / f"{factor}"
+        folder.mkdir()
+        for name in ("images", "sparse"):
+            (folder / name).symlink_to(tiny_folder / name)
+        (folder / "depths").mkdir()
+        for view in nw.load_scene(tiny_folder).train:
+            pixels, depths = view.camera.project(present(view.points))
+            plane = np.linalg.lstsq(np.c_[pixels, np.ones(len(pixels))], depths.numpy(), rcond=None)[0]
+            rows, columns = np.mgrid[0 : view.camera.height, 0 : view.camera.width]
+            plane = plane[0] * (columns + 0.5) + plane[1] * (rows + 0.5) + plane[2]
+            np.save(folder / "depths" / f"{Path(view.name).stem}.npy", factor * np.maximum(plane, 0.5))
+        targets.append([present(view.depth).float() for view in nw.load_scene(folder, follow_links=True).train])
+    for one, other in zip(*targets, strict=True):
+        assert ((one / other - 1).abs() < 2e-3).all()  # half precision, twice
+
+
+def test_a_run_with_maps_resumes_and_other_maps_are_another_scene(mapped: Scene, tmp_path: Path) -> None:
+    straight = trained(mapped, small())
+    assert_resumed_alike(straight, tmp_path)
+    other = dataclasses.replace(mapped, train=[mapped.train[0], *(at(view, 4.0) for view in mapped.train[1:])])
+    with pytest.raises(nw.errors.CheckpointError, match="photos, masks, depth maps or points have changed"):
+        Trainer(other, small(), "cpu").restore(tmp_path)
+
+
+def test_ranks_agree(mapped: Scene, tmp_path: Path) -> None:
+    def work(ranks: Ranks) -> object:
+        trainer = ParallelTrainer(mapped, small(), CPU, ranks)
+        terms = trainer.step().losses
+        trainer.run()
+        trainer.check()
+        assert "depth_maps" in terms
+        return digest(trainer)
+
+    first, second = run_ranks(2, work, tmp_path)
+    assert first == second
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("share", [1.0, 0.0])
+def test_maps_are_the_same_wherever_they_lie(mapped: Scene, monkeypatch: pytest.MonkeyPatch, share: float) -> None:
+    monkeypatch.setattr(sys.modules["nexwarp.train.target"], "PHOTO_SHARE", share)  # nexwarp.train is a function, too
+    views = TrainingViews(mapped.train, torch.device("cuda"))
+    for index, view in enumerate(mapped.train):
+        expected = torch.zeros(view.image.shape[:2]) if view.depth is None else view.depth.float()
+        assert_close(present(views.depth(index)).cpu(), expected, kind="value", name="depth")
