@@ -25,7 +25,7 @@ from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.sfm import SfmOptions, reconstruct
 from nexwarp.data.sfm.photos import InputPhoto, affordable_threads, camera_groups, list_photos
 from nexwarp.data.sfm.report import Overlaps, advise, components, left_out
-from nexwarp.data.sfm.stages import exhaustive_pairs, sequential_pairs
+from nexwarp.data.sfm.stages import Stages, exhaustive_pairs, sequential_pairs
 from nexwarp.errors import OutOfMemoryError, SceneError, StorageError
 from nexwarp.train import recipe
 from tests.cli.support import SMALL, refused, snapshot
@@ -164,6 +164,59 @@ def test_the_same_photos_give_the_same_bits(made, photos, tmp_path):
     ours, theirs = snapshot(tmp_path / "again"), snapshot(made)
     del ours["sfm.json"], theirs["sfm.json"]  # they hold seconds
     assert ours == theirs
+
+
+def test_the_global_mapper_finds_the_cameras_too(photos, arc, tmp_path):
+    report = reconstruct(photos, tmp_path / "scene", dataclasses.replace(PINHOLE, mapper="global"))
+    assert report.mapper == "global" and len(report.registered) == VIEWS
+    assert_cameras_agree(read_model(tmp_path / "scene", tmp_path / "scene" / "images"), arc.viewmats, within=0.01)
+
+
+@dataclasses.dataclass
+class Found:
+    """A model of so many photos."""
+
+    photos: int
+
+    def num_reg_images(self) -> int:
+        return self.photos
+
+    num_points3D = num_reg_images
+
+
+@pytest.mark.parametrize(
+    ("mapper", "incremental", "everywhere", "expected"),
+    [
+        ("auto", [7], None, (7, "incremental")),
+        ("auto", [5, 2], [6], (6, "global")),
+        ("auto", [2, 5], [5], (5, "incremental")),
+        ("auto", [], [4], (4, "global")),
+        ("auto", [5], ValueError("mapping: failed"), (5, "incremental")),
+        ("incremental", [5], None, (5, "incremental")),
+        ("global", None, [4, 6], (6, "global")),
+        ("global", None, ValueError("mapping: failed"), "mapping: failed"),
+        ("auto", [], [], "no scene could be made"),
+    ],
+)
+def test_the_mapper_that_registers_more_is_taken(mapper, incremental, everywhere, expected, tmp_path, monkeypatch):
+    """None is a mapper that is not asked."""
+
+    def answer(found):
+        assert found is not None
+        if isinstance(found, Exception):
+            raise found
+        return {index: Found(photos) for index, photos in enumerate(found)}
+
+    monkeypatch.setattr(Stages, "_incrementally", lambda self, done: answer(incremental))
+    monkeypatch.setattr(Stages, "_globally", lambda self: answer(everywhere))
+    stages = Stages(tmp_path, tmp_path, SfmOptions(mapper=mapper), lambda *_: None)
+    overlaps = Overlaps({str(i): 900 for i in range(7)}, {}, 21, False)
+    if isinstance(expected, str):
+        with pytest.raises(ValueError, match=expected):
+            stages._map(overlaps, lambda _: None)
+    else:
+        models, used = stages._map(overlaps, lambda _: None)
+        assert (models[0].num_reg_images(), used) == expected
 
 
 def test_photos_without_a_scene_are_processed_and_trained(photos, tmp_path, monkeypatch, capsys):

@@ -14,6 +14,7 @@ CameraModel = Literal[
     "auto", "simple_pinhole", "pinhole", "simple_radial", "radial", "opencv", "full_opencv", "opencv_fisheye"
 ]
 Matching = Literal["auto", "exhaustive", "sequential"]
+Mapper = Literal["auto", "incremental", "global"]
 
 EXHAUSTIVE_UP_TO = 150  # photos: 11,175 pairs, a quarter of an hour on two cores
 FEW_FEATURES = 500  # a photo
@@ -33,6 +34,9 @@ class SfmOptions:
     """Compare every pair (exhaustive) or neighbours by name (sequential); auto is exhaustive up to 150 photos."""
     overlap: Annotated[int, tyro.conf.arg(metavar="N")] = 10
     """Successors that a photo is compared with in sequential matching, in addition to those at 2, 4, 8, ... photos."""
+    mapper: Mapper = "auto"
+    """Register photo by photo (incremental) or all at once (global); auto tries global too where photos are left out,
+    and takes what registers more."""
     max_features: Annotated[int, tyro.conf.arg(metavar="N")] = 8192
     """SIFT features per photo; fewer are faster, more give more points."""
     max_image_size: Annotated[int, tyro.conf.arg(metavar="PIXELS")] = 3200
@@ -46,7 +50,8 @@ class SfmOptions:
 
     def check(self) -> None:
         """Raise ValueError, naming the option, when a value is out of range or unknown."""
-        for name, choices in (("cameras", Cameras), ("camera_model", CameraModel), ("matching", Matching)):
+        known = {"cameras": Cameras, "camera_model": CameraModel, "matching": Matching, "mapper": Mapper}
+        for name, choices in known.items():
             if getattr(self, name) not in get_args(choices):
                 expected = ", ".join(get_args(choices))
                 raise ValueError(f"{name}: expected one of {expected}, got {getattr(self, name)!r}")
@@ -99,13 +104,14 @@ class SfmReport:
     blurred: list[str]  # names of photos that are much less sharp than the others; they are used all the same
     repeated: list[str]  # names of photos that show nearly the same as the one before; they are used all the same
     frames: FrameChoice | None = None  # the frames of a video; None for photos
+    mapper: str = "incremental"  # or "global"
     skipped: dict[str, str] = field(default_factory=dict)  # name -> reason, for each photo that was not read
 
     def rows(self) -> dict[str, str]:
         """The figures as rows of a table: name -> text."""
         rows = {} if self.frames is None else self.frames.rows()
         rows |= {
-            "registered": f"{len(self.registered)} of {self.photos} photos",
+            "registered": f"{len(self.registered)} of {self.photos} photos ({self.mapper} mapper)",
             "points": f"{self.points:,}",
             "mean track length": f"{self.mean_track_length:.2f} photos",
             "mean reprojection error": f"{self.mean_reprojection_error:.3f} px",

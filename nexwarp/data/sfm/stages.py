@@ -91,7 +91,7 @@ class Stages:
             self._match(names, pairs, done)
             overlaps = self._overlaps(len(pairs), sequential)
         with self._stage("mapping", len(names)) as done:
-            models = self._map(overlaps, done)
+            models, mapper = self._map(overlaps, done)
         registered = _names(models[0])
         with self._stage("undistorting", len(registered)) as done:
             sizes = self._undistort(models[0], done)
@@ -111,6 +111,7 @@ class Stages:
             pairs=len(pairs),
             matched_pairs=len(overlaps.inliers),
             matching="sequential" if sequential else "exhaustive",
+            mapper=mapper,
             seconds={stage: round(value, 2) for stage, value in self.seconds.items()},
             advice=advise(overlaps, len(registered)),
             blurred=blurred,
@@ -217,8 +218,39 @@ class Stages:
                     inliers[images[one], images[other]] = count
         return Overlaps(features, inliers, pairs, sequential)
 
-    def _map(self, overlaps: Overlaps, done: Callable[[int], None]) -> list["pycolmap.Reconstruction"]:
-        """Return all models, largest first."""
+    def _map(self, overlaps: Overlaps, done: Callable[[int], None]) -> tuple[list["pycolmap.Reconstruction"], str]:
+        """Return all models, largest first, and the mapper that made them."""
+        models: list[pycolmap.Reconstruction] = []
+        chosen = self.options.mapper
+        used = "global" if chosen == "global" else "incremental"
+        if used == "incremental":
+            models = self._mapped(self._incrementally(done))
+        missed = not models or models[0].num_reg_images() < len(overlaps.features)
+        if chosen == "global" or (chosen == "auto" and missed):
+            try:
+                others = self._mapped(self._globally())
+            except ValueError:
+                if chosen == "global":
+                    raise
+                others = []  # what the first mapper made stays
+            if others and (not models or others[0].num_reg_images() > models[0].num_reg_images()):
+                models, used = others, "global"
+        if not models or models[0].num_reg_images() < MIN_MODEL or not models[0].num_points3D():
+            best = models[0].num_reg_images() if models else 0
+            advice = "; ".join(advise(overlaps, 0))
+            raise ValueError(
+                f"{self.photos}: no scene could be made: {best} of {len(overlaps.features)} photos registered, "
+                f"expected at least {MIN_MODEL}; {len(overlaps.inliers)} of {overlaps.pairs} pairs overlap; {advice}"
+            )
+        return models, used
+
+    @staticmethod
+    def _mapped(made: dict[int, "pycolmap.Reconstruction"]) -> list["pycolmap.Reconstruction"]:
+        """Return models, largest first."""
+        return sorted(made.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+
+    def _incrementally(self, done: Callable[[int], None]) -> dict[int, "pycolmap.Reconstruction"]:
+        """Register one photo after another."""
         pycolmap = pycolmap_module()
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = options.mapper.num_threads = self.threads
@@ -234,28 +266,31 @@ class Stages:
             nonlocal registered
             registered += 1
 
-        (self.folder / "models").mkdir()
-        made = run_stage(
+        folder = self.folder / "models"
+        folder.mkdir()
+        return run_stage(
             "mapping",
             lambda: pycolmap.incremental_mapping(
                 self.database,
                 self.readable,
-                self.folder / "models",
+                folder,
                 options,
                 initial_image_pair_callback=first_pair,
                 next_image_callback=next_photo,
             ),
             lambda: done(registered),
         )
-        models = sorted(made.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-        if not models or models[0].num_reg_images() < MIN_MODEL or not models[0].num_points3D():
-            best = models[0].num_reg_images() if models else 0
-            advice = "; ".join(advise(overlaps, 0))
-            raise ValueError(
-                f"{self.photos}: no scene could be made: {best} of {len(overlaps.features)} photos registered, "
-                f"expected at least {MIN_MODEL}; {len(overlaps.inliers)} of {overlaps.pairs} pairs overlap; {advice}"
-            )
-        return models
+
+    def _globally(self) -> dict[int, "pycolmap.Reconstruction"]:
+        """Estimate all rotations, then all positions, at once."""
+        pycolmap = pycolmap_module()
+        options = pycolmap.GlobalPipelineOptions()
+        options.num_threads = options.mapper.num_threads = self.threads
+        options.random_seed = options.mapper.random_seed = self.options.seed
+        options.min_model_size = MIN_MODEL
+        folder = self.folder / "global"
+        folder.mkdir()
+        return run_stage("mapping", lambda: pycolmap.global_mapping(self.database, self.readable, folder, options))
 
     def _undistort(self, model: "pycolmap.Reconstruction", done: Callable[[int], None]) -> list[tuple[int, int]]:
         """Write the scene; return the distinct sizes of its photos."""
