@@ -28,7 +28,7 @@ from nexwarp.model.edit import write_edits
 from nexwarp.model.model import Model
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.run import warmup
-from nexwarp.run.edit import EditOrder, added, described
+from nexwarp.run.edit import EditOrder, added, crop_command, described
 from nexwarp.run.evaluate import check_metrics, evaluate
 from nexwarp.run.export import RENDERED, ExportOrder, export_run
 from nexwarp.run.fit_poses import fit_poses
@@ -420,6 +420,7 @@ class ViewCommand:
             save_path=partial(
                 keep_camera_path, opened.folder, opened=self.run, origin=model.origin, frame=opened.frame
             ),
+            crop_command=partial(crop_command, opened),
         ) as viewer:
             show_until_interrupted(viewer, console)
 

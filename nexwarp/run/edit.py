@@ -129,6 +129,12 @@ def described(opened: OpenedModel) -> list[str]:
     return lines
 
 
+def crop_command(opened: OpenedModel, centre: np.ndarray, radius: float) -> str:
+    """Return the command that crops a run by a sphere, whose centre (3,) and radius are in the frame of its cameras."""
+    numbers = (*opened.frame.points(centre), radius * opened.frame.scale)
+    return f"nexwarp edit {opened.path} --crop sphere {' '.join(f'{x:.4g}' for x in numbers)}"
+
+
 def added(opened: OpenedModel, edit: Edit) -> OpenedModel:
     """Write one more edit of a run, and return the run with it; RunError, and no file changes, if nothing is left."""
     changed = dataclasses.replace(opened)

@@ -38,6 +38,7 @@ FPS, PLAY_FPS = 30, 20  # of a camera path, as it is kept and played
 SECONDS = (0.1, 600.0)
 MOST_VIEWS = 200  # of a path
 FOV_DEGREES = (15.0, 110.0)
+CROP_RADII, CROP_REACH = (0.05, 10.0), 100.0  # of a sphere, and of its centre's coordinates; browser units
 SCREENSHOT_HEIGHTS = (64, 2160)
 TELL_SECONDS = 0.5  # between two updates of a training's status line
 # Settings with a control, its label and hint; `Settings` has the values of a checkbox, `RANGES` those of a slider.
@@ -144,6 +145,32 @@ class PathEditor:
             self.note.content = f"The path was not saved: {error}"
 
 
+class CropEditor:
+    """A sphere that one client sees, and the command that crops by it."""
+
+    def __init__(self, session: "Session", command: Callable[[np.ndarray, float], str]) -> None:
+        self.world, self.command = session.world, command
+        gui = session.client.gui
+        self.shown = gui.add_checkbox("Show sphere", False, hint="What lies inside stays")
+        self.radius = gui.add_slider("Radius", *CROP_RADII, 0.01, 1.0)
+        self.centre = gui.add_vector3("Centre", _triple(self.world.to_browser(self.world.focus)), step=0.01)
+        self.note = gui.add_markdown("")
+        self.ball = session.client.scene.add_icosphere(
+            "/crop", 1.0, COLOURS["test"], wireframe=True, cast_shadow=False, receive_shadow=False, visible=False
+        )
+        on_change(self.shown, lambda _: self.update())
+        on_change(self.radius, lambda _: self.update())
+        on_change(self.centre, lambda _: self.update())
+        self.update()
+
+    def update(self) -> None:
+        """Draw the sphere of the controls, and show its command."""
+        radius = within(float(self.radius.value), CROP_RADII)
+        centre = np.array([within(float(x), (-CROP_REACH, CROP_REACH)) for x in self.centre.value])
+        self.ball.scale, self.ball.position, self.ball.visible = radius, _triple(centre), bool(self.shown.value)
+        self.note.content = f"`{self.command(self.world.to_scene(centre), radius * self.world.unit)}`"
+
+
 class TrainingPanel:
     """The controls of a training: progress and pause."""
 
@@ -205,6 +232,9 @@ class Session:
         for label, add in (("Look", self._look), ("Cameras", self._cameras), ("Record", self._record)):
             with tabs.add_tab(label):
                 add()
+        if viewer.crop_command is not None:
+            with tabs.add_tab("Crop"):
+                self.crop = CropEditor(self, viewer.crop_command)
         gui.add_divider(order=15.0)
         gui.add_markdown(HELP, order=20.0)
         self._add_frustums()
@@ -390,6 +420,11 @@ class Session:
         if status is not None:
             set_changed(self.status, "content", f'<div style="{SMALL}">{html.escape(status)}</div>')
         set_changed(self.controls["slot"], "visible", mode in BY_SLOT)
+
+
+def _triple(values: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 def _wxyz(pose: np.ndarray) -> tuple[float, float, float, float]:

@@ -59,6 +59,7 @@ class Viewer:
         *,
         photos: Mapping[str, Callable[[], torch.Tensor]] | None = None,
         save_path: Callable[[Sequence[Camera]], str] | None = None,
+        crop_command: Callable[[np.ndarray, float], str] | None = None,
     ) -> None:
         """Start the server. ValueError: the package viser is missing, or the address cannot be used.
 
@@ -68,8 +69,9 @@ class Viewer:
             options: title, address and the like.
             photos: "set/name" -> function that returns the (H, W, 3) uint8 photo, for thumbnails.
             save_path: writes a camera path into the run and returns the command that renders it; None offers none.
+            crop_command: returns the command that crops by a sphere, of its centre (3,) and radius; None offers none.
         """
-        self.model, self.options, self.save_path = model, options, save_path
+        self.model, self.options, self.save_path, self.crop_command = model, options, save_path, crop_command
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
         self.photos = photos or {}
         means = model().surfels.means

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from nexwarp.model.edit import EDIT_FILE
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
 from nexwarp.model.surfels import Surfels
+from nexwarp.run.edit import crop_command
 from nexwarp.run.folder import keep_camera_path, open_model
 from tests.cli.support import picture, read, refused, snapshot
 from tests.scenes import rigid
@@ -92,6 +94,18 @@ def test_the_ground_of_a_tilted_scene_becomes_y_0(tmp_path):
     assert np.allclose(levelled[:300, 1], 0, atol=1e-3) and np.allclose(levelled[380:, 1], -2, atol=1e-3)
     edit(tmp_path, "--level")
     assert np.allclose(open_model(tmp_path).frame.points(means.numpy()), levelled, atol=1e-3), "once is enough"
+
+
+def test_the_viewer_s_command_crops_by_the_sphere_it_shows(finished, capsys):
+    for move in MOVES:
+        edit(finished, *move)
+    opened = open_model(finished)
+    means = opened.trained.surfels.means.detach().double().numpy()
+    centre = np.median(means, axis=0)
+    radius = float(np.quantile(np.linalg.norm(means - centre, axis=1), 0.4))
+    program, *arguments = shlex.split(crop_command(opened, centre, radius))
+    assert program == "nexwarp" and cli.main(arguments) == 0
+    assert open_model(finished).kept.mean() == pytest.approx(0.4, abs=0.03)
 
 
 def test_the_list_says_where_the_subject_is(trained, capsys):

@@ -131,6 +131,31 @@ def test_a_path_is_played_and_kept_as_its_views_say(model, tmp_path, monkeypatch
         assert "at most 2 paths" in editor.note.content and len(list(tmp_path.iterdir())) == 2
 
 
+def test_a_sphere_is_drawn_and_its_command_shown(model) -> None:
+    """In the scene's units; what a browser sends is kept in range."""
+    commands: list[tuple[np.ndarray, float]] = []
+
+    def command(centre: np.ndarray, radius: float) -> str:
+        commands.append((centre, radius))
+        return "crop it"
+
+    with serving(model, crop_command=command) as viewer, Client(viewer) as client:
+        client.look()
+        wait_for(lambda: bool(viewer.sessions))
+        (session,) = viewer.sessions.values()
+        editor, unit = session.crop, viewer.world.unit
+        np.testing.assert_allclose(commands[-1][0], viewer.world.focus, atol=1e-6)
+        assert not editor.ball.visible and editor.note.content == "`crop it`"
+        editor.shown.value = True  # type: ignore[misc]
+        editor.radius.value = 2.0  # type: ignore[misc]
+        editor.centre.value = (1.0, math.nan, 1e9)  # type: ignore[misc]
+        editor.update()
+        assert editor.ball.visible and editor.ball.scale == 2.0
+        np.testing.assert_allclose(editor.ball.position, (1.0, -100.0, 100.0))
+        np.testing.assert_allclose(commands[-1][0], viewer.world.to_scene(np.array([1.0, -100.0, 100.0])))
+        assert commands[-1][1] == pytest.approx(2.0 * unit)
+
+
 # The first view: a camera that few frustums stand in front of, and frustums that stay apart
 
 K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
