@@ -37,6 +37,7 @@ from nexwarp.export.usd import save_usdz
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import JsonObject, write_json
 from nexwarp.model.compact import NOISE, NOISES
+from nexwarp.model.crop import REGIONS
 from nexwarp.model.edit import moved_poses, moved_surfels
 from nexwarp.model.model_file import save_model
 from nexwarp.run.evaluate import compared, psnr
@@ -114,8 +115,8 @@ def export_run(
     folder = order.out or opened.folder / EXPORT_FOLDER
     baked = order.format in BAKED
     fitted = baked and order.finetune and opened.source is not None
-    # Photos show what edits have removed.
-    train, test = _photos(opened, observe) if fitted and opened.kept.all() else ([], [])
+    fitted = fitted and not any(edit.name in REGIONS for edit in opened.edits)  # photos show what was cropped
+    train, test = _photos(opened, observe) if fitted else ([], [])
     files = [*_export(opened, order, folder, train, device, observe)]
     if test and order.format in READ:
         report(_quality(opened, files, test, device))
