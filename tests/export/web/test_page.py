@@ -1,7 +1,9 @@
 """The web page in a browser: loading, controls, links, touch, damaged files, and the baked scene against Python."""
 
 import functools
+import html
 import json
+import re
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -11,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 import nexwarp as nw
 from nexwarp.export.bake import bake
@@ -213,6 +216,32 @@ def test_each_renderer_turns_to_the_surfel_of_a_double_click(open_tab, renderer)
     # Software draws the baked scene faster: without a wish, the page takes it.
     tab.open()
     assert "baked" in tab.page.inner_text("#status") and not tab.errors
+
+
+@pytest.mark.parametrize("renderer", ["baked", "webgpu"])
+def test_pictures_embeds_and_turning(open_tab, renderer):
+    tab = open_tab(webgpu=True, permissions=["clipboard-read", "clipboard-write"], reduced_motion="no-preference")
+    page = tab.page
+    page.goto(f"{URL}?renderer={renderer}&turn")
+    tab.wait("globalThis.nexwarp?.state === 'ready' && nexwarp.frames > 0")
+    pose = tab.value(POSE)
+    tab.wait(f"Math.abs(nexwarp.pose.yaw - {pose[3]}) > 0.05")
+    assert tab.value(TARGET) == pytest.approx(tab.value(TARGET.replace("(nexwarp.pose)", "(nexwarp.start_)")), abs=1e-3)
+    page.get_by_role("button", name="Settings").click()
+    assert page.get_by_label("Turn by itself").is_checked()
+    page.get_by_label("Turn by itself").click()
+    tab.wait(FINISHED)
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Save a picture").click()
+    saved = np.asarray(Image.open(download.value.path()).convert("RGB")) / 255
+    assert download.value.suggested_filename == "nexwarp.png"
+    assert np.abs(saved - tab.picture().clip(0, 1)).max() < 0.51 / 255 and saved.std() > 0.05
+    page.get_by_role("button", name="Copy an embed").click()
+    tab.wait("document.getElementById('announce').textContent === 'The HTML is copied.'")
+    copied = tab.value("navigator.clipboard.readText()")
+    address = re.fullmatch(r'<iframe src="([^"]+)" width=.*></iframe>', copied)
+    assert address and html.unescape(address[1]) == tab.value("location.href")
+    assert f"?renderer={renderer}&turn#eye=" in html.unescape(address[1]) and not tab.errors
 
 
 def test_touch_on_a_phone(open_tab):

@@ -23,9 +23,12 @@ const FLIGHT_MILLISECONDS = 700; // from one camera to another
 const LINK_MILLISECONDS = 400; // after the last change, before the address follows
 const NOTE_MILLISECONDS = 3000; // that a note is shown
 const LARGEST_RATIO = 2; // canvas pixels to CSS pixels
+const TURN = 0.2; // radians a second, of a page that turns by itself: `?turn` in the address
+const EMBED = 'width="960" height="540" style="border:0" allow="fullscreen; clipboard-write" loading="lazy"';
 
 const element = id => document.getElementById(id);
 const query = new URLSearchParams(location.search);
+const still = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
 
 class Viewer {
     #pose = null;
@@ -189,7 +192,10 @@ class Viewer {
             this.#changed();
         };
         const buttons = {previous: "[", next: "]", home: "Home", fly: "v", link: "l", full: "f", more: ",", help: "?"};
-        for (const [id, key] of Object.entries(buttons)) element(id).onclick = () => this.act(key);
+        const inside = {picture: "p", turn: "t"}; // of the settings
+        for (const [id, key] of Object.entries({...buttons, ...inside})) element(id).onclick = () => this.act(key);
+        element("embed").onclick = () => this.#copyEmbed();
+        if (query.has("turn") && !still()) this.#setTurning(true);
         element("full").hidden = !document.fullscreenEnabled;
     }
 
@@ -204,6 +210,8 @@ class Viewer {
             f: () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()),
             ",": () => this.#toggleSettings(),
             m: () => this.#nextMode(),
+            p: () => this.#savePicture(),
+            t: () => this.#setTurning(!this.turning),
             "?": () => element("help-dialog").showModal(),
         };
         if (!Object.hasOwn(actions, key)) return false;
@@ -238,6 +246,22 @@ class Viewer {
         this.#announce(flying ? "Flying: drag to look around." : "Orbiting: drag to turn the scene.");
     }
 
+    #setTurning(turning) {
+        this.turning = turning;
+        element("turn").checked = turning;
+    }
+
+    #advanceTurn(seconds) {
+        if (!this.turning || this.flight || this.controls.busy) return;
+        this.#pose = this.#pose.turned(TURN * seconds, 0, false);
+        this.#changed();
+    }
+
+    #savePicture() {
+        this.saving = true; // the next frame, which is of full resolution
+        this.dirty = true;
+    }
+
     #toggleSettings() {
         const settings = element("settings");
         settings.hidden = !settings.hidden;
@@ -252,7 +276,7 @@ class Viewer {
 
     #flyTo(pose, text) {
         if (text) this.#announce(text);
-        if (matchMedia("(prefers-reduced-motion: reduce)").matches) {
+        if (still()) {
             this.pose = pose;
             return;
         }
@@ -260,14 +284,24 @@ class Viewer {
         this.#changed();
     }
 
-    async #copyLink() {
-        this.#writeLink();
+    async #copy(text, done, failed) {
         try {
-            await navigator.clipboard.writeText(location.href);
-            this.#announce("The link is copied.", true);
+            await navigator.clipboard.writeText(text);
+            this.#announce(done, true);
         } catch {
-            this.#announce("The address of this page is the link.", true);
+            this.#announce(failed, true);
         }
+    }
+
+    #copyLink() {
+        this.#writeLink();
+        return this.#copy(location.href, "The link is copied.", "The address of this page is the link.");
+    }
+
+    #copyEmbed() {
+        this.#writeLink();
+        const address = location.href.replaceAll("&", "&amp;").replaceAll('"', "&quot;");
+        return this.#copy(`<iframe src="${address}" ${EMBED}></iframe>`, "The HTML is copied.", "The browser did not copy it.");
     }
 
     #writeLink() {
@@ -311,10 +345,11 @@ class Viewer {
             before = now;
             this.controls.advance(seconds);
             this.#advanceFlight();
+            this.#advanceTurn(seconds);
             const refine = this.refined !== "full" && !this.pacing.moving;
             if (!this.dirty && !refine) continue;
             this.dirty = false;
-            const options = this.pacing.options;
+            const options = this.saving ? {resolutionScale: 1} : this.pacing.options;
             this.refined = options.resolutionScale === 1 || this.pacing.fixed !== null ? "full" : "coarse";
             this.drawing = true;
             try {
@@ -330,12 +365,24 @@ class Viewer {
         const camera = this.#pose.camera(this.canvas.width, this.canvas.height, this.near);
         const {mode, exposure} = this;
         const {milliseconds} = await this.renderer.render(camera, {...options, mode, exposure});
+        if (this.saving) await this.#download();
         if (++this.frames === 1) {
             element("poster").classList.add("gone");
             performance.mark("first picture");
         }
         this.pacing.took(milliseconds, options);
         this.#showStatus(options);
+    }
+
+    async #download() {
+        this.saving = false;
+        const {width, height} = this.canvas, page = new OffscreenCanvas(width, height);
+        const pixels = Uint8ClampedArray.from(await this.renderer.read("image"), (x, i) => (i % 4 === 3 ? 255 : 255 * x));
+        page.getContext("2d").putImageData(new ImageData(pixels, width, height), 0, 0);
+        const address = URL.createObjectURL(await page.convertToBlob());
+        Object.assign(document.createElement("a"), {href: address, download: "nexwarp.png"}).click();
+        URL.revokeObjectURL(address);
+        this.#announce("The picture is saved.", true);
     }
 
     #advanceFlight() {
