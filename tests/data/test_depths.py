@@ -18,7 +18,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.data.capture import Cloud
 from nexwarp.data.depth_files import read_depth
-from nexwarp.data.depth_fit import fit_depths
+from nexwarp.data.depth_fit import Fit, _error, fit_depths
 from nexwarp.errors import MissingError, SceneError
 from nexwarp.io.pictures import save_exr
 from tests.narrowing import present
@@ -168,6 +168,7 @@ def test_maps_go_through_the_lens_as_photos_do(folder: Path, monkeypatch: pytest
         rays = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], axis=-1)
         column = 2 * lens.project(rays.reshape(-1, 3))[:, 0].reshape(depth.shape)
         assert np.abs(depth - 0.5 - column)[depth > 0].max() <= 0.5 + 1e-3
+        assert np.array_equal(depth, np.round(depth)), "columns are mixed"
         assert np.array_equal(depth > 0, np.ones_like(depth) if view.mask is None else view.mask.numpy())
 
 
@@ -255,6 +256,15 @@ def test_scale_and_shift_are_absorbed(kind: str) -> None:
         fitted = present(view.depth)
         assert fitted.dtype == torch.float16
         assert (fitted.float() / torch.from_numpy(z) - 1).abs().max() < 0.02
+
+
+def test_larger_values_of_depth_maps_are_never_nearer() -> None:
+    """A falling line fits the depths of a small range as well as their inverses do, but not beyond."""
+    depths = np.linspace(2.0, 2.2, 50)
+    values = 1 / depths
+    falling = Fit(*np.polyfit(values, depths, 1).tolist())
+    assert falling.scale < 0 and _error(falling, values, depths) == np.inf
+    assert _error(Fit(1.0, inverse=True), values, depths) < 1e-3
 
 
 def test_a_photo_of_few_points_has_the_scale_of_the_others() -> None:

@@ -75,6 +75,16 @@ def test_graphs_give_the_bits_of_launches(tiny_scene: Scene, changes: dict[str, 
     assert_same_state(replayed, launched)
 
 
+def test_photos_with_and_without_depth_maps_share_a_graph(tiny_scene: Scene) -> None:
+    maps = [torch.full(view.image.shape[:2], 3.0).half() for view in tiny_scene.train]
+    pairs = enumerate(zip(tiny_scene.train, maps, strict=True))
+    views = [dataclasses.replace(view, depth=depth if index % 2 else None) for index, (view, depth) in pairs]
+    scene = dataclasses.replace(tiny_scene, train=views)
+    launched, replayed = trained(scene, cuda_graphs=False), trained(scene)
+    assert graphs_of(replayed) == 1
+    assert_same_state(replayed, launched)
+
+
 def test_the_first_step_after_a_round_is_captured(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rounds replace tensors, and nothing else of what a step launches."""
     trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
