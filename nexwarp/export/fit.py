@@ -17,9 +17,9 @@ from nexwarp.model.model import Model
 from nexwarp.ops.atlas import Cut
 
 WINDOW = 256  # largest width and height that one step draws
-PASSES = 4.0  # over the views' pixels
+PASSES = 12.0  # over the views' pixels
 FEWEST_STEPS = 400
-MOST_STEPS = {"cuda": 4000, "cpu": 800}
+MOST_STEPS = {"cuda": 20_000, "cpu": 2000}
 RATES = {"texels": 0.02, "logits": 0.02, "sh0": 5e-3, "shN": 2e-3}
 LAST_RATE = 0.05  # relative to the first
 STEEPNESS = 40.0, 400.0  # of the coverage of cut-outs, first and last
@@ -62,13 +62,14 @@ def fit(
     if steps is None:
         windows = sum(camera.width * camera.height for camera in cameras_of(views)) / WINDOW**2
         steps = min(max(round(PASSES * windows), FEWEST_STEPS), MOST_STEPS.get(device.type, FEWEST_STEPS))
-    start = {"texels": scene.texels}
+    start = {"texels": scene.texels.flatten(0, 1)}
     if scene.harmonics is not None:
         start |= {"sh0": scene.harmonics[0], "shN": scene.harmonics[1]}
         start["logits"] = torch.logit(scene.shape.opacities, 1e-6)
     trained = {name: x.detach().clone().requires_grad_() for name, x in start.items()}
-    groups = [{"params": [x], "lr": RATES[name]} for name, x in trained.items()]
-    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+    # Moments of a texel or surfel rest while no window shows it: its next step would else be one of the sign alone.
+    groups = [{"params": [x], "lr": RATES[name]} for name, x in trained.items() if x.numel()]
+    optimizer = torch.optim.SparseAdam(groups, betas=(0.9, 0.99), eps=1e-12)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, LAST_RATE ** (1 / max(steps, 1)))
     scene = replace(scene, exposures=None)
     for done, window in zip(range(1, steps + 1), _windows(model, views), strict=False):
@@ -80,18 +81,28 @@ def fit(
         loss = errors.mean() if window.mask is None else (errors * window.mask[..., None]).mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        for x in trained.values():
+            _keep_nonzero_rows(x)
         optimizer.step()
         schedule.step()
         if scene.harmonics is None:
             with torch.no_grad():
-                trained["texels"].clamp_(0, 1)[..., 3].clamp_(max=ALPHA_MAX)
+                trained["texels"].clamp_(0, 1)[:, 3].clamp_(max=ALPHA_MAX)
         progress(done, steps)
     return _drawn(scene, {name: x.detach() for name, x in trained.items()}, None)
 
 
+def _keep_nonzero_rows(parameter: torch.Tensor) -> None:
+    """Replace a parameter's gradient by a sparse one of the rows that are not 0."""
+    if (grad := parameter.grad) is not None and grad.numel():
+        rows = grad.reshape(len(grad), -1).any(1).nonzero()[:, 0]
+        sparse = {"check_invariants": False, "is_coalesced": True}
+        parameter.grad = torch.sparse_coo_tensor(rows[None], grad[rows], grad.shape, **sparse)
+
+
 def _drawn(scene: BakedScene, trained: dict[str, torch.Tensor], share: float | None) -> BakedScene:
     """Return the scene with trained values, its cut-outs as soft as after a share of the steps; None is as shown."""
-    scene = replace(scene, texels=trained["texels"])
+    scene = replace(scene, texels=trained["texels"].view_as(scene.texels))
     if scene.cut is not None and share is not None:
         first, last = STEEPNESS
         scene = replace(scene, cut=Cut(scene.cut.cutoff, first * (last / first) ** share, LAYERS))

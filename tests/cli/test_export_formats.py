@@ -55,7 +55,7 @@ def test_a_finished_run_becomes_gltf_usd_and_spz(finished, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("kind", "stages"),
     [
-        ("web", {"reading photos": 10, "measuring surfels": 8, "baking the texture": 2}),
+        ("web", {"reading photos": 10, "measuring surfels": 8, "baking the texture": 3}),
         ("mesh", {"choosing the voxel": 8, "finding surfaces": 8, "fusing depths": 8}),
     ],
 )
