@@ -96,8 +96,9 @@ def _keep_nonzero_rows(parameter: torch.Tensor) -> None:
     """Replace a parameter's gradient by a sparse one of the rows that are not 0."""
     if (grad := parameter.grad) is not None and grad.numel():
         rows = grad.reshape(len(grad), -1).any(1).nonzero()[:, 0]
-        sparse = {"check_invariants": False, "is_coalesced": True}
-        parameter.grad = torch.sparse_coo_tensor(rows[None], grad[rows], grad.shape, **sparse)
+        parameter.grad = torch.sparse_coo_tensor(
+            rows[None], grad[rows], grad.shape, check_invariants=False, is_coalesced=True
+        )
 
 
 def _drawn(scene: BakedScene, trained: dict[str, torch.Tensor], share: float | None) -> BakedScene:

@@ -133,10 +133,10 @@ def test_a_json_file_of_any_size_is_not_read(demo, tmp_path):
 def test_unknown_keys_are_named_once(demo, tmp_path):
     def change(data):
         data |= {"aabb_scale": 16, "orientation_override": "none", "offset": [1, 2]}
-        data["frames"][0] |= {"sharpness": 12.5, "colmap_im_id": 3, "depth_file_path": "../nowhere"}
+        data["frames"][0] |= {"sharpness": 12.5, "colmap_im_id": 3, "normal_file_path": "../nowhere"}
 
     path = edit(write_nerfstudio(demo, tmp_path / "scene"), change)
-    with pytest.warns(UserWarning, match=r"keys that are not read: depth_file_path, orientation_override$") as caught:
+    with pytest.warns(UserWarning, match=r"keys that are not read: normal_file_path, orientation_override$") as caught:
         scene = load_scene(path)
     assert len(caught) == 1
     assert_same_cameras(scene, load_scene(demo))
