@@ -38,6 +38,8 @@ class Viewer {
         this.pacing = new Pacing();
         this.mode = "image";
         this.flying = false;
+        this.turning = false;
+        this.saving = false; // of a picture
         this.exposure = "photos";
         this.flight = null;
         this.frames = 0;
