@@ -30,7 +30,7 @@ FINISHED = f"{DRAWN} && !nexwarp.dirty && !nexwarp.drawing && !nexwarp.flight &&
 DRAW = """async camera => {
     const renderer = nexwarp.renderer;
     nexwarp.state = "failed"; // stops the page's own frames
-    renderer.resize(camera.width, camera.height);
+    Object.assign(nexwarp.canvas, {width: camera.width, height: camera.height});
     await renderer.render(camera);
     return [Array.from(await renderer.read("image")), await renderer.pick(32.5, 24.5)];
 }"""
@@ -366,4 +366,4 @@ def test_the_live_demo_of_the_documentation(tab):
     tab.open("?renderer=baked")
     assert tab.picture().std() > 0.1 and not tab.errors
     header, _ = support.read_sections(files[SCENE_FILE])
-    assert header["surfels"] == tab.value("nexwarp.renderer.info.surfels")
+    assert header["surfels"] == tab.value("nexwarp.renderer.surfels")

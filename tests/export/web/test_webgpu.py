@@ -21,20 +21,20 @@ from tests.tolerances import FLIPS, WEB_PSNR, assert_close, assert_same_ids
 pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"), pytest.mark.timeout(300)]
 PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 <script type="importmap">{"imports": {"nexwarp/": "./"}}</script>
-<canvas id="canvas" width="37" height="27"></canvas>
 <script type="module">
 import { Renderer } from "nexwarp/renderer.js";
 import { SceneReader } from "nexwarp/scene.js";
 window.nexwarp = { Renderer, SceneReader };
 </script>"""
-OPEN = """async ([file, settings, canvas]) => {
+OPEN = """async ([file, settings]) => {
     window.stages = [];
     window.renderer?.destroy();
-    window.target = canvas ? document.getElementById("canvas") : null;
+    window.target = document.createElement("canvas");
     window.renderer = await nexwarp.Renderer.create(target, { onStage: (stage) => stages.push(stage), ...settings });
     await renderer.load(file);
 }"""
 RENDER = """async ([camera, options, names]) => {
+    Object.assign(target, {width: camera.width, height: camera.height});
     const frame = await renderer.render(camera, options);
     const buffers = {};
     for (const name of names) buffers[name] = Array.from(await renderer.read(name));
@@ -67,12 +67,14 @@ CASES: dict[str, dict[str, Any]] = {
 class RendererTab(Tab):
     """A page with the renderer's modules."""
 
-    def load(self, model: nw.Model, *, quality: str = "full", canvas: bool = False, **settings: Any) -> nw.Camera:
+    def load(
+        self, model: nw.Model, *, quality: str = "full", poster: bytes | None = None, **settings: Any
+    ) -> nw.Camera:
         """Load a model into a new renderer; its file has the camera of `web_model`, which is returned."""
         camera = web_model()[1]
-        file = encode_scene(model, named_cameras(camera), quality=quality, poster=b"picture" if canvas else None)
+        file = encode_scene(model, named_cameras(camera), quality=quality, poster=poster)
         self.files["scene.nxw"] = file
-        self.value(OPEN, ["scene.nxw", settings, canvas])
+        self.value(OPEN, ["scene.nxw", settings])
         return camera
 
     def render(self, camera: nw.Camera, *names: str, **options: Any) -> dict[str, torch.Tensor]:
@@ -107,9 +109,8 @@ def default(tab) -> tuple[nw.Model, nw.Camera]:
 def test_the_canvas_shows_the_model(tab):
     model, camera = web_model()
     expected = model.render(camera)
-    tab.load(model, canvas=True)
-    info = tab.value("renderer.info")
-    assert info["textured"] and info["surfels"] == len(model.surfels)
+    tab.load(model, poster=b"picture")
+    assert tab.value("renderer.textured") and tab.value("renderer.surfels") == len(model.surfels)
     assert tab.value("stages") == ["header", "geometry", "grid", "done"]
     out = tab.render(camera, "ids")
     assert psnr(out["image"], expected.image) > WEB_PSNR["full"]

@@ -6,9 +6,7 @@ export async function asset(name) {
     if (element !== null) {
         const text = atob(element.textContent.trim());
         const bytes = new Uint8Array(text.length);
-        for (let i = 0; i < text.length; i++) {
-            bytes[i] = text.charCodeAt(i);
-        }
+        for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
         return new Blob([bytes]).stream();
     }
     const response = await fetch(new URL(name, document.baseURI));

@@ -3,7 +3,7 @@
 
 import {asset} from "nexwarp/assets.js";
 import {BakedScene} from "nexwarp/baked_scene.js";
-import {positionOf, resized} from "nexwarp/program.js";
+import {depthSpan, positionOf, resized} from "nexwarp/program.js";
 import {BAKED, SceneError, SceneReader} from "nexwarp/scene.js";
 import {QUADS_FRAGMENT, QUADS_VERTEX, RESOLVE_FRAGMENT, RESOLVE_VERTEX} from "nexwarp/baked_shaders.js";
 
@@ -213,7 +213,7 @@ export class BakedRenderer {
         gl.uniform4fv(uniforms.intrinsics, camera.K);
         gl.uniform2f(uniforms.size, target.width, target.height);
         gl.uniform2f(uniforms.outputSize, width, height);
-        gl.uniform2fv(uniforms.span, scene.depthSpan(positionOf(camera.viewmat)));
+        gl.uniform2fv(uniforms.span, depthSpan(scene.header, camera.viewmat));
         gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
 
@@ -244,17 +244,8 @@ export class BakedRenderer {
         return scene.pick(last.camera, (x * target.width) / canvas.width, (y * target.height) / canvas.height);
     }
 
-    resize(width, height) {
-        Object.assign(this.canvas, {width, height});
-    }
-
-    get info() {
-        const {gl, scene} = this;
-        const names = gl.getExtension("WEBGL_debug_renderer_info");
-        const adapter = gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
-        const {width, height} = scene?.header.atlas ?? {width: 0, height: 0};
-        const bytes = scene ? scene.geometry.byteLength + scene.harmonics.byteLength + 4 * width * height : 0;
-        return {adapter, f16: this.half, surfels: scene?.count ?? 0, megabytes: bytes / 1e6, maxHits: null, textured: true};
+    get surfels() {
+        return this.header?.surfels ?? 0;
     }
 
     destroy() {

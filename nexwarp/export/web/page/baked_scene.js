@@ -83,15 +83,6 @@ export class BakedScene {
         return gainsOf(this.header.exposures, this.arrays.exposures, viewmat);
     }
 
-    // Depths that the depth picture shows from dark to bright.
-    depthSpan(eye) {
-        const [low, high] = this.header.bounds;
-        const middle = low.map((x, i) => (x + high[i]) / 2);
-        const radius = Math.hypot(...low.map((x, i) => (high[i] - x) / 2)) || 1;
-        const away = Math.hypot(...middle.map((x, i) => x - eye[i]));
-        return [Math.max(away - radius, 0), away + radius];
-    }
-
     // Where a pixel's transmittance falls to one half, or the last hit; null where next to nothing is hit.
     pick(camera, x, y) {
         const world = rayOf(camera, x, y), eye = positionOf(camera.viewmat);

@@ -175,7 +175,7 @@ void main() {
     float t = min(dot(ray, ray) / falloff.z, 1.0);
     color *= gains * exp(t * (falloff.x + falloff.y * t));
   } else if (mode == 3) {
-    color = x.a > 0.0 ? viridis(clamp(1.0 - (x.r / x.a - span.x) / max(span.y - span.x, 1e-12), 0.0, 1.0)) : vec3(0.0);
+    color = x.a > 0.0 ? viridis(clamp((x.r / x.a - span.x) / max(span.y - span.x, 1e-12), 0.0, 1.0)) : vec3(0.0);
   } else if (mode == 4) {
     color = length(color) > 0.0 ? normalize(color) * 0.5 + 0.5 : vec3(0.0);
   } else if (mode == 5) {

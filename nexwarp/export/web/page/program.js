@@ -42,16 +42,12 @@ export function constantsOf({ options, texture, surfels, sh_coefficients }) {
 
 // WGSL text of a shader. `texts` holds the .wgsl files by name, `half` says whether the MLP is in half precision.
 export function sourceOf(name, constants, texts, features, half) {
-    if (WITHOUT_CONSTANTS.includes(name)) {
-        return texts[name];
-    }
+    if (WITHOUT_CONSTANTS.includes(name)) return texts[name];
     const lines = [];
     let parts = [texts.common, texts[name]];
     if (name === "shade") {
         const scalar = half ? "f16" : "f32";
-        if (half) {
-            lines.push("enable f16;");
-        }
+        if (half) lines.push("enable f16;");
         lines.push(`alias Scalar = ${scalar};`, `alias Weight = vec4<${scalar}>;`);
         const [kind, size] = isUniform(constants, half) ? ["uniform", `, ${mlpBlocks(constants)}`] : ["storage, read", ""];
         lines.push(`@group(0) @binding(6) var<${kind}> mlp: array<mat4x4<${scalar}>${size}>;`);
@@ -118,9 +114,7 @@ export function gainsOf(exposures, poses, viewmat) {
         }
         const r = Math.sqrt(3 * squares) / length;
         const kernel = (1 + r) * Math.exp(-r);
-        for (let k = 0; k < 3; k++) {
-            sums[k] += kernel * poses[i + 6 + k];
-        }
+        for (let k = 0; k < 3; k++) sums[k] += kernel * poses[i + 6 + k];
     }
     return sums.map((x, k) => Math.exp(Math.min(Math.max(x, exposures.lowest[k]), exposures.highest[k])));
 }
@@ -140,6 +134,14 @@ export function positionOf(viewmat) {
 // Direction of the ray through a place of the image, world frame, with a z-depth of 1.
 export function rayOf({ viewmat, K: [fx, fy, cx, cy] }, x, y) {
     return [0, 1, 2].map((k) => (viewmat[k] * (x - cx)) / fx + (viewmat[4 + k] * (y - cy)) / fy + viewmat[8 + k]);
+}
+
+// Depths that the depth picture shows from dark to bright: those of a ball around the scene.
+export function depthSpan({ bounds: [low, high] }, viewmat) {
+    const eye = positionOf(viewmat);
+    const radius = Math.hypot(...low.map((x, i) => (high[i] - x) / 2)) || 1;
+    const away = Math.hypot(...low.map((x, i) => (x + high[i]) / 2 - eye[i]));
+    return [Math.max(away - radius, 0), away + radius];
 }
 
 // Uniform values of a frame: struct Frame of common.wgsl.

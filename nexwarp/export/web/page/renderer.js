@@ -1,31 +1,17 @@
 // The WebGPU renderer: the passes of nexwarp/kernels in WGSL.
 
 import { assetText, asset } from "nexwarp/assets.js";
-import {
-    FRAME_BYTES,
-    MODES,
-    SCAN_BLOCK,
-    SHARING,
-    SORT_BLOCK,
-    TILE,
-    constantsOf,
-    frameValues,
-    isUniform,
-    packedMatrices,
-    positionOf,
-    rayOf,
-    resized,
-    sourceOf,
-} from "nexwarp/program.js";
+import { FRAME_BYTES, MODES, SCAN_BLOCK, SHARING, SORT_BLOCK, TILE } from "nexwarp/program.js";
+import { constantsOf, depthSpan, frameValues, isUniform, packedMatrices } from "nexwarp/program.js";
+import { positionOf, rayOf, resized, sourceOf } from "nexwarp/program.js";
 import { SceneError, SceneReader, toHalf, unpackGrid, unpackSurfels, unpackWeights } from "nexwarp/scene.js";
-
-export { SceneError };
 
 const SHADERS = ["common", "project", "scan", "sort", "lists", "collect", "shade", "compose", "blit"];
 const FIRST_ENTRIES = 2 ** 18;
 const MOST_ENTRIES = 2 ** 28;
 const SPARE = 1.5;
 const MOST_GROUPS = 65535;
+const SOFTWARE = /swiftshader|llvmpipe|basic render/i; // adapters that are no GPU
 
 // Bindings of the entry points: index to the buffer's name.
 const BINDINGS = {
@@ -63,55 +49,37 @@ async function openDevice() {
         throw new SceneError("This browser has no WebGPU. Recent versions of Chrome, Edge, Safari and Firefox have it.");
     }
     const adapter = await navigator.gpu.requestAdapter({ powerPreference: "high-performance" });
-    if (adapter === null) {
-        throw new SceneError("This browser has WebGPU, but found no GPU that it can use.");
-    }
+    if (adapter === null) throw new SceneError("This browser has WebGPU, but found no GPU that it can use.");
     const limits = {};
-    for (const name of ["maxBufferSize", "maxStorageBufferBindingSize"]) {
-        limits[name] = adapter.limits[name];
-    }
+    for (const name of ["maxBufferSize", "maxStorageBufferBindingSize"]) limits[name] = adapter.limits[name];
     const requiredFeatures = adapter.features.has("shader-f16") ? ["shader-f16"] : [];
     return { adapter, device: await adapter.requestDevice({ requiredFeatures, requiredLimits: limits }) };
 }
 
 export class Renderer {
     // Opens a GPU. Throws SceneError, with a line for people, where there is none.
-    static async create(canvas = null, { onProgress, onStage, onLost, half = true } = {}) {
+    static async create(canvas, { onProgress = () => {}, onStage = () => {}, onLost = () => {}, half = true } = {}) {
         const { adapter, device } = await openDevice();
-        const renderer = new Renderer();
         const info = device.adapterInfo ?? adapter.info ?? {};
-        const software = info.isFallbackAdapter === true || /swiftshader|llvmpipe/i.test(`${info.architecture} ${info.description}`);
-        renderer.device = device;
-        renderer.canvas = canvas;
-        renderer.adapter = [info.vendor, info.architecture, info.description].filter(Boolean).join(" ") || "GPU";
+        const adapterName = [info.vendor, info.architecture, info.description].filter(Boolean).join(" ") || "GPU";
+        const software = info.isFallbackAdapter === true || SOFTWARE.test(adapterName);
+        const renderer = new Renderer();
+        Object.assign(renderer, { device, canvas, onProgress, onStage, software, adapterName, modes: MODES });
+        Object.assign(renderer, { buffers: {}, pipelines: {}, plans: new Map(), capacity: FIRST_ENTRIES, size: null });
+        Object.assign(renderer, { chain: Promise.resolve(), destroyed: false });
         renderer.half = half && device.features.has("shader-f16");
-        renderer.onProgress = onProgress ?? (() => {});
-        renderer.onStage = onStage ?? (() => {});
-        renderer.buffers = {};
-        renderer.pipelines = {};
-        renderer.plans = new Map();
-        renderer.capacity = FIRST_ENTRIES;
-        renderer.size = null;
-        renderer.chain = Promise.resolve();
-        renderer.destroyed = false;
-        renderer.bytesOnGpu = 0;
         device.lost.then((lost) => {
             if (!renderer.destroyed) {
                 renderer.destroyed = true;
-                onLost?.(new SceneError(`The GPU was lost: ${lost.message || lost.reason}`));
+                onLost(new SceneError(`The GPU was lost: ${lost.message || lost.reason}`));
             }
         });
         // Software adapters cannot show a canvas in every configuration of a browser: their pictures are copied to it.
-        renderer.copied = software;
-        if (canvas !== null) {
-            renderer.context = canvas.getContext(software ? "2d" : "webgpu");
-            if (renderer.context === null) {
-                throw new SceneError("This browser gives the canvas no WebGPU context.");
-            }
-            if (!software) {
-                renderer.format = navigator.gpu.getPreferredCanvasFormat();
-                renderer.context.configure({ device, format: renderer.format, alphaMode: "opaque" });
-            }
+        renderer.context = canvas.getContext(software ? "2d" : "webgpu");
+        if (renderer.context === null) throw new SceneError("This browser gives the canvas no WebGPU context.");
+        if (!software) {
+            renderer.format = navigator.gpu.getPreferredCanvasFormat();
+            renderer.context.configure({ device, format: renderer.format, alphaMode: "opaque" });
         }
         return renderer;
     }
@@ -144,9 +112,7 @@ export class Renderer {
             next("done");
         } catch (error) {
             await reader.cancel();
-            if (error instanceof RangeError) {
-                throw new SceneError("This device has too little memory for the scene.");
-            }
+            if (error instanceof RangeError) throw new SceneError("This device has too little memory for the scene.");
             throw error;
         }
     }
@@ -159,9 +125,7 @@ export class Renderer {
             "SH coefficients": 12 * header.surfels * header.sh_coefficients,
             "texture grid": texture === null ? 0 : 2 * texture.levels * texture.table_size * texture.features,
         };
-        for (const [name, size] of Object.entries(sizes)) {
-            this.checkSize(name, size);
-        }
+        for (const [name, size] of Object.entries(sizes)) this.checkSize(name, size);
     }
 
     checkSize(name, size) {
@@ -175,13 +139,9 @@ export class Renderer {
     makeBuffer(name, size, uniform = false) {
         const bytes = Math.max(Math.ceil(size / 16) * 16, 16);
         this.checkSize(name, bytes);
-        if (this.buffers[name]) {
-            this.bytesOnGpu -= this.buffers[name].size;
-            this.buffers[name].destroy();
-        }
+        if (this.buffers[name]) this.buffers[name].destroy();
         const kind = uniform ? GPUBufferUsage.UNIFORM : GPUBufferUsage.STORAGE | GPUBufferUsage.COPY_SRC;
         this.buffers[name] = this.device.createBuffer({ label: name, size: bytes, usage: kind | GPUBufferUsage.COPY_DST });
-        this.bytesOnGpu += bytes;
         return this.buffers[name];
     }
 
@@ -211,7 +171,7 @@ export class Renderer {
         this.texts = Object.fromEntries(names.map((name, i) => [name, texts[i]]));
         this.constants = constantsOf(this.header);
         await Promise.all(ENTRIES.map(([name, entry]) => this.pipeline(name, entry)));
-        if (this.canvas !== null && !this.copied) {
+        if (!this.software) {
             const module = this.device.createShaderModule({ label: "blit", code: this.texts.blit });
             this.blit = await this.device.createRenderPipelineAsync({
                 layout: "auto",
@@ -229,7 +189,6 @@ export class Renderer {
         const { geometry, limits, sh } = unpackSurfels(this.header, arrays);
         const count = this.header.surfels;
         this.poses = arrays.exposures ?? null;
-        this.geometry = geometry;
         this.upload("geometry", geometry);
         this.upload("seen", limits ?? new Float32Array(4));
         this.upload("sh", sh);
@@ -239,9 +198,7 @@ export class Renderer {
         this.makeBuffer("starts", 4 * count * SHARING);
         this.makeBuffer("start_sums", 4 * (this.constants.TOTAL + 1));
         this.upload("surfel count", Uint32Array.of(count));
-        for (const name of ["keys", "order", "keys2", "order2"]) {
-            this.makeBuffer(name, 4 * count);
-        }
+        for (const name of ["keys", "order", "keys2", "order2"]) this.makeBuffer(name, 4 * count);
         this.staging = this.device.createBuffer({ size: 16, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
     }
 
@@ -270,18 +227,15 @@ export class Renderer {
             throw new SceneError("The renderer has no scene, or has been closed.");
         }
         const { mode = "image", resolutionScale = 1, textureScale = 1, leastWeight = 0, exposure = "photos" } = options;
-        if (!MODES.includes(mode)) {
-            throw new SceneError(`mode: expected one of ${MODES.join(", ")}, got ${mode}`);
-        }
+        if (!MODES.includes(mode)) throw new SceneError(`mode: expected one of ${MODES.join(", ")}, got ${mode}`);
         const start = performance.now();
         this.camera = camera; // of `pick`
-        const full = this.canvas ?? camera;
-        const width = Math.max(Math.round(full.width * resolutionScale), 1);
-        const height = Math.max(Math.round(full.height * resolutionScale), 1);
+        const width = Math.max(Math.round(this.canvas.width * resolutionScale), 1);
+        const height = Math.max(Math.round(this.canvas.height * resolutionScale), 1);
         const view = resized(camera, width, height);
         const step = Math.min(Math.max(Math.round(1 / textureScale), 1), 4);
         const textured = this.textured === true;
-        const depths = mode === "depth" ? this.depthRange(view.viewmat) : [0, 1];
+        const depths = depthSpan(this.header, view.viewmat);
         this.makeImageBuffers(width, height);
         for (;;) {
             this.makeLists();
@@ -289,9 +243,7 @@ export class Renderer {
             this.device.queue.writeBuffer(this.buffers.frame, 0, frameValues(this.header, this.poses, view, settings));
             const entries = await this.submit(width, height, step);
             if (entries <= this.capacity) {
-                if (this.canvas !== null && this.copied) {
-                    await this.copy(width, height);
-                }
+                if (this.software) await this.copy(width, height);
                 return { milliseconds: performance.now() - start, entries };
             }
             if (entries > MOST_ENTRIES) {
@@ -304,9 +256,7 @@ export class Renderer {
     // Submits the passes of a frame; returns the number of entries that the tile lists needed.
     async submit(width, height, step) {
         const key = `${width} ${height} ${step} ${this.capacity}`;
-        if (!this.plans.has(key)) {
-            this.plans.set(key, this.plan(width, height, step));
-        }
+        if (!this.plans.has(key)) this.plans.set(key, this.plan(width, height, step));
         const encoder = this.device.createCommandEncoder();
         const pass = encoder.beginComputePass();
         for (const [pipeline, bindings, groups] of this.plans.get(key)) {
@@ -315,9 +265,7 @@ export class Renderer {
             pass.dispatchWorkgroups(...groups);
         }
         pass.end();
-        if (this.canvas !== null && !this.copied) {
-            this.show(encoder, width, height);
-        }
+        if (!this.software) this.show(encoder, width, height);
         encoder.copyBufferToBuffer(this.buffers.start_sums, 4 * this.constants.TOTAL, this.staging, 0, 4);
         this.device.queue.submit([encoder.finish()]);
         await this.staging.mapAsync(GPUMapMode.READ, 0, 4);
@@ -327,9 +275,7 @@ export class Renderer {
     }
 
     makeImageBuffers(width, height) {
-        if (this.size !== null && this.size[0] === width && this.size[1] === height) {
-            return;
-        }
+        if (this.size !== null && this.size[0] === width && this.size[1] === height) return;
         this.plans.clear();
         this.size = null;
         const pixels = width * height;
@@ -338,24 +284,16 @@ export class Renderer {
         for (const [name, size] of Object.entries(sizes)) {
             this.checkSize(`a picture of ${width} x ${height} pixels`, size * pixels);
         }
-        for (const [name, size] of Object.entries(sizes)) {
-            this.makeBuffer(name, size * pixels);
-        }
+        for (const [name, size] of Object.entries(sizes)) this.makeBuffer(name, size * pixels);
         this.makeBuffer("tile_starts", 4 * (Math.ceil(width / TILE) * Math.ceil(height / TILE) + 1));
-        if (this.canvas !== null) {
-            this.makeBuffer("blit", 16, true);
-        }
+        this.makeBuffer("blit", 16, true);
         this.size = [width, height];
     }
 
     makeLists() {
-        if (this.lists === this.capacity) {
-            return;
-        }
+        if (this.lists === this.capacity) return;
         this.plans.clear();
-        for (const name of ["tiles", "surfels", "tiles2", "surfels2"]) {
-            this.makeBuffer(name, 4 * this.capacity);
-        }
+        for (const name of ["tiles", "surfels", "tiles2", "surfels2"]) this.makeBuffer(name, 4 * this.capacity);
         this.lists = this.capacity;
     }
 
@@ -393,9 +331,7 @@ export class Renderer {
     // Name of a uniform buffer of four words, made once.
     words(...values) {
         const name = `uniform ${values}`;
-        if (!this.buffers[name]) {
-            this.upload(name, Uint32Array.from(values), true);
-        }
+        if (!this.buffers[name]) this.upload(name, Uint32Array.from(values), true);
         return name;
     }
 
@@ -453,26 +389,6 @@ export class Renderer {
         this.context.drawImage(picture, 0, 0, this.canvas.width, this.canvas.height);
     }
 
-    // The 2nd and 98th percentile of the depths of surfels before the camera.
-    depthRange(viewmat) {
-        const count = this.header.surfels;
-        const stride = Math.max(Math.floor(count / 10000), 1);
-        const depths = [];
-        for (let i = 0; i < count; i += stride) {
-            const [x, y, z] = this.geometry.subarray(12 * i, 12 * i + 3);
-            const depth = viewmat[8] * x + viewmat[9] * y + viewmat[10] * z + viewmat[11];
-            if (depth > 0) {
-                depths.push(depth);
-            }
-        }
-        if (depths.length === 0) {
-            return [0, 1];
-        }
-        depths.sort((a, b) => a - b);
-        const at = (q) => depths[Math.min(Math.floor(q * depths.length), depths.length - 1)];
-        return [at(0.02), Math.max(at(0.98), at(0.02) * (1 + 1e-6) + 1e-6)];
-    }
-
     async readBuffer(name, offset, size) {
         const staging = this.device.createBuffer({ size, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
         const encoder = this.device.createCommandEncoder();
@@ -497,51 +413,30 @@ export class Renderer {
     async pick(x, y) {
         await this.chain;
         const hits = this.header.options.max_hits;
-        if (this.size === null || hits === 0) {
-            return null;
-        }
+        if (this.size === null || hits === 0) return null;
         const [width, height] = this.size;
-        const full = this.canvas ?? { width, height };
-        const column = Math.min(Math.max(Math.floor((x * width) / full.width), 0), width - 1);
-        const row = Math.min(Math.max(Math.floor((y * height) / full.height), 0), height - 1);
+        const column = Math.min(Math.max(Math.floor((x * width) / this.canvas.width), 0), width - 1);
+        const row = Math.min(Math.max(Math.floor((y * height) / this.canvas.height), 0), height - 1);
         const offset = 4 * hits * (row * width + column);
         const id = new Int32Array(await this.readBuffer("ids", offset, 4))[0];
         const depth = new Float32Array(await this.readBuffer("depths", offset, 4))[0];
-        if (id < 0) {
-            return null;
-        }
+        if (id < 0) return null;
         const view = resized(this.camera, width, height);
         const ray = rayOf(view, column + 0.5, row + 0.5);
         const position = positionOf(view.viewmat).map((x, k) => x + depth * ray[k]);
         return { id, depth, position };
     }
 
-    resize(width, height) {
-        if (this.canvas !== null) {
-            this.canvas.width = width;
-            this.canvas.height = height;
-        }
-    }
-
-    get info() {
-        return {
-            adapter: this.adapter,
-            f16: this.half,
-            surfels: this.header?.surfels ?? 0,
-            megabytes: this.bytesOnGpu / 1e6,
-            maxHits: this.header?.options.max_hits ?? 0,
-            textured: this.textured === true,
-        };
+    get surfels() {
+        return this.header?.surfels ?? 0;
     }
 
     destroy() {
         this.destroyed = true;
-        for (const buffer of Object.values(this.buffers)) {
-            buffer.destroy();
-        }
+        for (const buffer of Object.values(this.buffers)) buffer.destroy();
         this.buffers = {};
         this.plans.clear();
-        this.context?.unconfigure?.();
+        this.context.unconfigure?.();
         this.device.destroy();
     }
 }

@@ -24,9 +24,7 @@ const SIZES = { u8: 1, u16: 2, u32: 4, f16: 2, f32: 4 };
 const ARRAYS = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array, f16: Uint16Array, f32: Float32Array };
 
 function expect(condition, message) {
-    if (!condition) {
-        throw new SceneError(`scene file: ${message}`);
-    }
+    if (!condition) throw new SceneError(`scene file: ${message}`);
 }
 
 function isInteger(value, low, high) {
@@ -73,9 +71,7 @@ function checkScene(header) {
 }
 
 function checkTexture(texture) {
-    if (texture === null) {
-        return;
-    }
+    if (texture === null) return;
     expect(isObject(texture), "texture: expected an object");
     const ranges = { levels: [1, 64], table_size: [1, 2 ** 26], width: [1, 4096], hidden_layers: [0, 64], sh_degree: [0, 3] };
     for (const [name, [low, high]] of Object.entries(ranges)) {
@@ -90,9 +86,7 @@ function checkTexture(texture) {
 }
 
 function checkExposures(exposures) {
-    if (exposures === null) {
-        return;
-    }
+    if (exposures === null) return;
     expect(isObject(exposures) && isInteger(exposures.count, 1, 30000), "exposures.count: expected 1 to 30000");
     for (const [name, count] of Object.entries({ mean: 3, lengths: 2, falloff: 3, lowest: 3, highest: 3 })) {
         expect(areNumbers(exposures[name], count), `exposures.${name}: expected ${count} numbers`);
@@ -160,15 +154,11 @@ function sceneSections(header) {
               ...limits(["limits_scale", "f32", [2]], ["limits", "u16", [2, count]]),
               ["sh", "u8", [coefficients * 3, count]],
           ];
-    if (header.exposures !== null) {
-        sections.push(["exposures", "f32", [header.exposures.count, 9]]);
-    }
+    if (header.exposures !== null) sections.push(["exposures", "f32", [header.exposures.count, 9]]);
     if (texture !== null) {
         const weights = matrixShapes(texture).reduce((sum, [out, into]) => sum + out * into, 0);
         sections.push(["mlp", full ? "f32" : "f16", [weights]]);
-        if (!full) {
-            sections.push(["grid_ranges", "f32", [texture.levels, 2]]);
-        }
+        if (!full) sections.push(["grid_ranges", "f32", [texture.levels, 2]]);
         sections.push(["grid", full ? "f16" : "u8", [texture.levels, texture.table_size, texture.features]]);
     }
     return sections;
@@ -209,9 +199,7 @@ class ByteReader {
     async read(count) {
         while (this.held < count) {
             const { done, value } = await this.reader.read();
-            if (done) {
-                throw new SceneError("scene file: the file ends before its content does");
-            }
+            if (done) throw new SceneError("scene file: the file ends before its content does");
             this.parts.push(value);
             this.held += value.length;
             this.received += value.length;
@@ -251,9 +239,7 @@ async function inflate(bytes, size, name) {
     try {
         for (;;) {
             const { done, value } = await reader.read();
-            if (done) {
-                break;
-            }
+            if (done) break;
             expect(filled + value.length <= size, `section ${name}: expected ${size} bytes, got more`);
             content.set(value, filled);
             filled += value.length;
@@ -331,9 +317,7 @@ export class SceneReader {
             expect(size <= LARGEST_SECTION, `section ${entry.name}: expected at most ${LARGEST_SECTION} bytes, got ${size}`);
             let bytes = await this.content(entry, size);
             expect(["raw", "deflate"].includes(entry.encoding), `section ${entry.name}: expected the encoding raw or deflate`);
-            if (entry.encoding === "deflate") {
-                bytes = await inflate(bytes, size, entry.name);
-            }
+            if (entry.encoding === "deflate") bytes = await inflate(bytes, size, entry.name);
             expect(bytes.length === size, `section ${entry.name}: expected ${size} bytes, got ${bytes.length}`);
             this.arrays[entry.name] = new ARRAYS[entry.dtype](bytes.buffer, 0, size / SIZES[entry.dtype]);
         }
@@ -362,13 +346,9 @@ export function unpackSurfels(header, arrays) {
     const unpacked = full ? arrays : dequantised(header, arrays);
     for (let i = 0; i < count; i++) {
         const row = 12 * i;
-        for (let k = 0; k < 3; k++) {
-            geometry[row + k] = unpacked.means[3 * i + k];
-        }
+        for (let k = 0; k < 3; k++) geometry[row + k] = unpacked.means[3 * i + k];
         geometry[row + 3] = unpacked.opacities[i];
-        for (let k = 0; k < 4; k++) {
-            geometry[row + 4 + k] = unpacked.quats[4 * i + k];
-        }
+        for (let k = 0; k < 4; k++) geometry[row + 4 + k] = unpacked.quats[4 * i + k];
         for (let k = 0; k < 2; k++) {
             geometry[row + 8 + k] = unpacked.scales[2 * i + k];
             geometry[row + 10 + k] = unpacked.gammas[2 * i + k];
@@ -399,9 +379,7 @@ function dequantised(header, arrays) {
         return arrays.ranges[at] + arrays.ranges[at + 1] * code;
     };
     for (let i = 0; i < count; i++) {
-        for (let k = 0; k < 3; k++) {
-            means[3 * i + k] = value(i, k, arrays.means[k * count + i]);
-        }
+        for (let k = 0; k < 3; k++) means[3 * i + k] = value(i, k, arrays.means[k * count + i]);
         for (let k = 0; k < 2; k++) {
             scales[2 * i + k] = Math.exp(value(i, 3 + k, arrays.scales[k * count + i]));
             gammas[2 * i + k] = Math.max(Math.exp(value(i, 5 + k, arrays.gammas[k * count + i])), 1);
@@ -439,9 +417,7 @@ export function toHalf(x) {
     float[0] = x;
     const sign = (bits[0] >>> 16) & 0x8000;
     const magnitude = bits[0] & 0x7fffffff;
-    if (magnitude >= 0x47800000) {
-        return sign | (magnitude > 0x7f800000 ? 0x7e00 : 0x7c00);
-    }
+    if (magnitude >= 0x47800000) return sign | (magnitude > 0x7f800000 ? 0x7e00 : 0x7c00);
     if (magnitude < 0x38800000) {
         // Subnormal: a multiple of 2^-24.
         const steps = Math.abs(x) * 2 ** 24;
@@ -458,21 +434,15 @@ export function fromHalf(half) {
     const exponent = (half >>> 10) & 31;
     const mantissa = half & 1023;
     const sign = half & 0x8000 ? -1 : 1;
-    if (exponent === 0) {
-        return sign * mantissa * 2 ** -24;
-    }
-    if (exponent === 31) {
-        return mantissa ? NaN : sign * Infinity;
-    }
+    if (exponent === 0) return sign * mantissa * 2 ** -24;
+    if (exponent === 31) return mantissa ? NaN : sign * Infinity;
     return sign * (1 + mantissa / 1024) * 2 ** (exponent - 15);
 }
 
 // The grid as bits of half-precision numbers.
 export function unpackGrid(header, arrays) {
     if (header.quality === "full") {
-        for (const half of arrays.grid) {
-            expect((half & 0x7c00) !== 0x7c00, "section grid: expected finite values");
-        }
+        for (const half of arrays.grid) expect((half & 0x7c00) !== 0x7c00, "section grid: expected finite values");
         return arrays.grid;
     }
     const levels = header.texture.levels;
@@ -484,9 +454,7 @@ export function unpackGrid(header, arrays) {
             table[code] = toHalf(Math.fround(arrays.grid_ranges[2 * level] + Math.fround(arrays.grid_ranges[2 * level + 1] * code)));
             expect((table[code] & 0x7c00) !== 0x7c00, "section grid_ranges: expected finite values");
         }
-        for (let i = level * size; i < (level + 1) * size; i++) {
-            grid[i] = table[arrays.grid[i]];
-        }
+        for (let i = level * size; i < (level + 1) * size; i++) grid[i] = table[arrays.grid[i]];
     }
     return grid;
 }

@@ -18,7 +18,6 @@ const MODES = {
     normals: "normals",
     alpha: "opacity",
 };
-const SOFTWARE = /swiftshader|llvmpipe|basic render/i; // adapters that are no GPU: the baked scene is faster there
 const FLIGHT_MILLISECONDS = 700; // from one camera to another
 const LINK_MILLISECONDS = 400; // after the last change, before the address follows
 const NOTE_MILLISECONDS = 3000; // that a note is shown
@@ -84,7 +83,7 @@ class Viewer {
             try {
                 const renderer = await Renderer.create(this.canvas, events);
                 this.renderer = renderer;
-                software = wanted !== "webgpu" && SOFTWARE.test(renderer.info.adapter);
+                software = wanted !== "webgpu" && renderer.software; // the baked scene is faster there
                 if (software) throw new SceneError("WebGPU runs on the CPU here.");
                 await renderer.load(SCENE_FILE);
             } catch (error) {
@@ -174,8 +173,7 @@ class Viewer {
 
     #settings({exposures}) {
         const mode = element("mode"), camera = element("camera");
-        const modes = this.renderer.modes ?? Object.keys(MODES);
-        mode.replaceChildren(...modes.map(name => new Option(MODES[name] ?? name, name)));
+        mode.replaceChildren(...this.renderer.modes.map(name => new Option(MODES[name] ?? name, name)));
         mode.value = this.mode;
         mode.onchange = () => this.setMode(mode.value);
         const options = this.cameras.map(({name}, i) => new Option(name, String(i)));
@@ -320,8 +318,7 @@ class Viewer {
         const mode = new URLSearchParams(text).get("mode") ?? "image";
         if (!pose) return;
         this.pose = pose;
-        const modes = this.renderer.modes ?? Object.keys(MODES);
-        const offered = modes.includes(mode) ? mode : "image";
+        const offered = this.renderer.modes.includes(mode) ? mode : "image";
         if (offered !== this.mode) {
             this.mode = offered;
             if (element("mode").options.length) element("mode").value = offered;
@@ -334,7 +331,7 @@ class Viewer {
         const height = Math.max(Math.round(this.canvas.clientHeight * ratio), 1);
         if (width === this.canvas.width && height === this.canvas.height && this.sized) return;
         this.sized = true;
-        this.renderer.resize(width, height);
+        Object.assign(this.canvas, {width, height});
         this.#changed();
     }
 
@@ -397,7 +394,7 @@ class Viewer {
     }
 
     #showStatus({resolutionScale}) {
-        const {width, height} = this.canvas, {surfels} = this.renderer.info;
+        const {width, height} = this.canvas, {surfels} = this.renderer;
         const size = `${Math.round(width * resolutionScale)} × ${Math.round(height * resolutionScale)}`;
         const kind = this.renderer instanceof BakedRenderer ? "baked, WebGL" : "exact, WebGPU";
         const time = this.pacing.milliseconds.toFixed(0);
