@@ -40,8 +40,8 @@ from nexwarp.model.compact import NOISE, NOISES
 from nexwarp.model.crop import REGIONS
 from nexwarp.model.edit import moved_poses, moved_surfels
 from nexwarp.model.model_file import save_model
-from nexwarp.run.evaluate import compared, psnr
-from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
+from nexwarp.run.evaluate import compared, lpips_vgg, psnr, ssim, weights_file
+from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, METRICS_FILE, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
 from nexwarp.train.recipe import MASK_MODES
 
 # Packages that formats need, and their extras.
@@ -50,6 +50,7 @@ SPLAT_WRITERS = {"ply": save_splats_ply, "spz": save_splats_spz, "gltf-splats": 
 RENDERED = ("mesh", "web", "glb", "usd")  # formats that are made of renderings, stage by stage
 BAKED = ("web", "glb", "usd")  # formats whose texture is baked, and fitted to photos
 READ = ("web", "glb")  # of these, those that can be read back
+Figures = dict[str, dict[str, float]]  # metrics on test views, of what was baked and of the model
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows
 
 
@@ -119,7 +120,12 @@ def export_run(
     train, test = _photos(opened, observe) if fitted else ([], [])
     files = [*_export(opened, order, folder, train, device, observe)]
     if test and order.format in READ:
-        report(_quality(opened, files, test, device))
+        figures, size = _quality(opened, files, test, device), sum(file.stat().st_size for file in files)
+        report(_line(figures, len(test), size))
+        beside = folder.parent if folder.suffix == ".html" else folder
+        known = read_metrics(beside).get("exports")
+        files.append(beside / METRICS_FILE)
+        write_json(files[-1], {"exports": (known if isinstance(known, dict) else {}) | {files[0].name: {**figures}}})
     # Compact models and cameras say themselves where their frame lies in the world.
     if order.format not in ("compact", "cameras") and any(opened.model.origin or ()) and opened.frame.is_identity:
         files.append((folder.parent if folder.suffix == ".html" else folder) / ORIGIN_FILE)
@@ -214,8 +220,8 @@ def _photos(opened: OpenedModel, observe: Progress) -> tuple[list[View], list[Vi
 
 
 @torch.no_grad()
-def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], device: torch.device | str) -> str:
-    """Return a line with the PSNR of a baked file and of the model on test views, and the file's size."""
+def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], device: torch.device | str) -> Figures:
+    """Return metrics of a baked file and of the model on test views; LPIPS where its weights are at hand."""
     model = opened.model.to(device)
     file = next(file for file in files if file.suffix in (".html", GLB))
     scene, exposures = load_baked(file).to(device), None
@@ -227,12 +233,25 @@ def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], 
         image = scene.render(motion.camera(camera), background=model.options.background)
         return image if exposures is None else image * exposures.factors(camera)
 
-    baked, neural = (
-        fmean(psnr(render(view.camera.to(device)), view.image, view.mask) for view in views)
-        for render in (shown, model.render_image)
+    figures: Figures = {}
+    for name, render in (("baked", shown), ("neural", model.render_image)):
+        pictures = [(render(view.camera.to(device)), view.image, view.mask) for view in views]
+        figures[name] = {
+            "psnr": fmean(psnr(*each) for each in pictures),
+            "ssim": fmean(ssim(*each) for each in pictures),
+        }
+        if weights_file().is_file():
+            figures[name]["lpips"] = fmean(value for each in pictures if (value := lpips_vgg(*each)) is not None)
+    return figures
+
+
+def _line(figures: Figures, views: int, size: int) -> str:
+    """Return what a person reads of them."""
+    psnr, lpips = (
+        ", ".join(f"{each[metric]:.{digits}f}{unit} {name}" for name, each in figures.items() if metric in each)
+        for metric, digits, unit in (("psnr", 2, " dB"), ("lpips", 3, ""))
     )
-    size = sum(path.stat().st_size for path in files) / 1e6
-    return f"test PSNR: {baked:.2f} dB baked, {neural:.2f} dB neural, {len(views)} views; {size:.1f} MB"
+    return f"test PSNR: {psnr}, {views} views; {size / 1e6:.1f} MB" + (f"; LPIPS: {lpips}" if lpips else "")
 
 
 def _noise(opened: OpenedModel) -> float:

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from platform import node
 from typing import Any
@@ -91,7 +92,7 @@ OURS = re.compile(
             r"camera_path_[1-9]\d*\.json",
             rf"(?:{_any(CHECKPOINTS)}|{_ASIDE})/{_any(CHECKPOINT_FILES)}",
             rf"{TENSORBOARD_FOLDER}/events\.out\.tfevents\.[^/]*",
-            rf"{EXPORT_FOLDER}/{_any([ORIGIN_FILE, *(name for names in EXPORTS.values() for name in names)])}",
+            rf"{EXPORT_FOLDER}/{_any([METRICS_FILE, ORIGIN_FILE, *chain(*EXPORTS.values())])}",
             rf"{RENDERS_FOLDER}/(?:{_any(PROJECTIONS)}/)?(?:{_any(PATHS)}|path_[^/]+)/\d{{4,}}\.(?:png|exr)",
         ]
     )

@@ -95,6 +95,7 @@ def test_an_export_learns_from_training_photos_alone(finished, tmp_path):
     """And tells the PSNR of what was written on the test photos."""
     source = present(open_model(finished).source)
     results = {"as it is": baked_files(finished)}
+    figures = read_metrics(finished / "page")["exports"]["index.html"]
     for group in ("test", "train"):
         scene = shutil.copytree(source.path, tmp_path / group)
         for name in open_model(finished).cameras[group]:
@@ -107,6 +108,8 @@ def test_an_export_learns_from_training_photos_alone(finished, tmp_path):
     assert results["train"][0] != files
     psnr = read_metrics(finished)["psnr"]
     assert re.fullmatch(rf"test PSNR: [\d.]+ dB baked, {psnr:.2f} dB neural, 2 views; [\d.]+ MB", line)
+    assert figures["neural"]["psnr"] == pytest.approx(psnr, abs=1e-3) and set(figures["baked"]) == {"psnr", "ssim"}
+    assert f"{figures['baked']['psnr']:.2f} dB baked" in line
     without, lines = baked_files(finished, finetune=False)
     assert without != files and not lines
     with pytest.warns(UserWarning, match="the photos cannot be read .* nothing is fitted to them"):
