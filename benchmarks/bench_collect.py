@@ -83,16 +83,19 @@ def rasterize(scene: SurfelScene, options: Options) -> list[Measurement]:
         hits = nw.rasterize(*g.shape, colors, scene.camera, MAX_HITS)
         return hits.plain, hits.depths, hits.weights, hits.alpha, hits.points, hits.directions
 
-    def timed(name: str, run: Callable[[torch.Tensor], tuple[torch.Tensor, ...]], colors: torch.Tensor) -> Measurement:
+    def both_ways(
+        run: Callable[[torch.Tensor], tuple[torch.Tensor, ...]], colors: torch.Tensor
+    ) -> Callable[[], object]:
         leaves, results = (*g.shape, colors), differentiable(run(colors))
         signals = random_like(results)
-        return options.time(
-            name, lambda: torch.autograd.grad(differentiable(run(colors)), leaves, signals), **scene.facts
-        )
+        return lambda: torch.autograd.grad(differentiable(run(colors)), leaves, signals)
 
-    passes = timed("passes of a training step, forward + backward", trained, g.colors)
-    three = timed("rasterize, 3 channels, forward + backward", plain, g.colors)
-    sixteen = timed("rasterize, 16 channels, forward + backward", plain, wide)
+    runs = {
+        "passes of a training step, forward + backward": both_ways(trained, g.colors),
+        "rasterize, 3 channels, forward + backward": both_ways(plain, g.colors),
+        "rasterize, 16 channels, forward + backward": both_ways(plain, wide),
+    }
+    passes, three, sixteen = options.time_in_turns(runs, **scene.facts)
     return [
         passes,
         three,

@@ -3,7 +3,7 @@
 import argparse
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,9 +37,13 @@ class Options:
         return self.device.type == "cuda"
 
     def time(self, name: str, run: Callable[[], Any], **facts: Any) -> Measurement:
+        """Time one function, see `time_in_turns`."""
+        return self.time_in_turns({name: run}, **facts)[0]
+
+    def time_in_turns(self, runs: Mapping[str, Callable[[], Any]], **facts: Any) -> list[Measurement]:
         """Call `timing.measure` on this device, with few repeats when quick."""
         repeats = Repeats(seconds=0.0, warmup=1, least=2) if self.quick else Repeats()
-        return measure(name, run, self.device, repeats=repeats, **facts)
+        return measure(runs, self.device, repeats=repeats, **facts)
 
 
 Stage = Callable[[Options], list[Measurement]]

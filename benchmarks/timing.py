@@ -8,7 +8,7 @@ import os
 import platform
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -90,38 +90,40 @@ class Repeats:
 
 
 def measure(
-    name: str,
-    run: Callable[[], Any],
+    runs: Mapping[str, Callable[[], Any]],
     device: torch.device,
     *,
     scene: str = "",
     sizes: dict[str, Any] | None = None,
     note: str = "",
     repeats: Repeats = Repeats(),
-) -> Measurement:
-    """Time a function after warming it up.
+) -> list[Measurement]:
+    """Time functions after warming them up: in turns, so that what slows the machine for a while slows them all.
 
     On CUDA each run lies between two events and is waited for, so that launches that are slower than the kernels count.
 
     Args:
-        name: of the measurement.
-        run: what to time; called without arguments.
+        runs: what to time, by name; called without arguments. With several, the peak of memory is that of all.
         device: where it runs.
-        scene: of the measurement.
-        sizes: of the measurement.
-        note: of the measurement.
-        repeats: how often it is timed.
+        scene: of the measurements.
+        sizes: of the measurements.
+        note: of the measurements.
+        repeats: how often each is timed.
     """
-    for _ in range(repeats.warmup):
+    for run in list(runs.values()) * repeats.warmup:
         run()
     clock = _cuda_clock if device.type == "cuda" else _wall_clock
     synchronize(device)
     reset_peak(device)
     start = time.perf_counter()
-    times: list[float] = []
-    while len(times) < repeats.least or (len(times) < repeats.most and time.perf_counter() - start < repeats.seconds):
-        times.append(clock(run))
-    return figure(name, times, device, scene=scene, sizes=sizes, note=note, peak_mib=peak(device))
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    done, most = 0, repeats.seconds * len(runs)
+    while done < repeats.least or (done < repeats.most and time.perf_counter() - start < most):
+        for name, run in runs.items():
+            times[name].append(clock(run))
+        done += 1
+    facts: dict[str, Any] = {"scene": scene, "sizes": sizes, "note": note, "peak_mib": peak(device)}
+    return [figure(name, values, device, **facts) for name, values in times.items()]
 
 
 def figure(
