@@ -78,10 +78,9 @@ def test_the_first_atlas_has_the_colors_of_the_texture(residual, cameras):
     assert psnr(image, expected) > max(45, psnr(plain, expected) + 10)
 
 
-def test_images_are_those_of_the_definition_and_the_fit_approaches_the_model(baked, model, cameras):
+def test_the_fit_approaches_the_model(baked, model, cameras):
     gains = []
     for camera in cameras.values():
-        assert psnr(rendered(baked, camera), support.composited(copy.deepcopy(baked), camera)) > 80
         expected = model.render(camera).image.detach()
         first = psnr(rendered(evaluate(model, baked.seen, baked.layout), camera), expected)
         plain = psnr(model.bare(max_hits=0).render(camera).image.detach(), expected)

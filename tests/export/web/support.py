@@ -15,16 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from scipy.ndimage import map_coordinates
 
 import nexwarp as nw
-from nexwarp import ops
 from nexwarp.export.bake import Baked
 from nexwarp.export.web.baked import encode_harmonics, encode_picture
 from nexwarp.export.web.quantise import CHUNK
-from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
 from nexwarp.model.texture import NEVER
-from tests.reference.collect import rotations
 from tests.scenes import intrinsics, make_camera, make_surfels, random_scene, rigid
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -123,38 +119,13 @@ def rendered(baked: Baked, camera: nw.Camera) -> torch.Tensor:
     return baked.scene().render(camera)
 
 
-def bilinear(atlas: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-    """Values (..., C) of an image (H, W, C) at places (..., 2), column and row of texel centres."""
-    at = [places[..., 1].numpy(), places[..., 0].numpy()]
-    channels = [map_coordinates(channel, at, order=1, mode="nearest") for channel in atlas.movedim(-1, 0).numpy()]
-    return torch.from_numpy(np.stack(channels, -1))
-
-
-@torch.no_grad()
-def composited(baked: Baked, camera: nw.Camera) -> torch.Tensor:
-    """The image (H, W, 3) in float64, without tiles: every surfel at every pixel."""
-    surfels = baked.surfels.double()
-    viewmat, eye = camera.viewmat.double(), camera.position.double()
-    frames = rotations(surfels.quats)
-    y, x = torch.meshgrid(torch.arange(camera.height).double(), torch.arange(camera.width).double(), indexing="ij")
-    rays = torch.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, torch.ones_like(x)], -1)
-    rays = rays.reshape(-1, 3) @ viewmat[:3, :3]
-    depths = ((surfels.means - eye) * frames[:, :, 2]).sum(1) / (rays @ frames[:, :, 2].T)
-    offsets = eye + depths[..., None] * rays[:, None] - surfels.means
-    local = torch.einsum("pni,nij->pnj", offsets, frames)[..., :2] / surfels.scales
-    exponents = local.square().clamp_min(TINY).pow(surfels.gammas).sum(-1)
-    alphas = (surfels.opacities * torch.exp(-0.5 * exponents)).clamp(max=ALPHA_MAX)
-    alphas = alphas.where((alphas >= ALPHA_MIN) & (depths > camera.near), 0.0)
-    plain = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, eye, baked.model.options.sh_degree)
-    ids = torch.arange(len(surfels.means)).expand(local.shape[:2])
-    places = baked.layout.texels(ids, local)
-    colors = (plain + bilinear(baked.atlas.double(), places)).clamp_min(0)
-    image, left = torch.zeros(len(rays), 3).double(), torch.ones(len(rays), 1).double()
-    for i in ((surfels.means @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]).argsort().tolist():
-        image += left * alphas[:, i, None] * colors[:, i]
-        left *= 1 - alphas[:, i, None]
-    image += left * torch.tensor(baked.model.options.background).double()
-    return image.reshape(camera.height, camera.width, 3)
+def bilinear(texels: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Texels (height, width, C) at places (..., 2), column and row; differentiable."""
+    left, top = places.detach().floor().long().unbind(-1)
+    right, bottom = (left + 1).clamp(max=texels.shape[1] - 1), (top + 1).clamp(max=texels.shape[0] - 1)
+    fx, fy = (places - places.detach().floor())[..., None].unbind(-2)
+    upper = texels[top, left] * (1 - fx) + texels[top, right] * fx
+    return upper * (1 - fy) + (texels[bottom, left] * (1 - fx) + texels[bottom, right] * fx) * fy
 
 
 def read_sections(content: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
