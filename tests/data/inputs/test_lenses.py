@@ -5,36 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from nexwarp.data import load_scene
 from nexwarp.data.lens import Intrinsics, Lens, undistortion
 from tests.data.inputs import room
 from tests.data.inputs.support import assert_same_cameras
 from tests.data.test_scene import make_scene
-from tests.scene_writers import demo_lens, photograph, write_nerfstudio
+from tests.scene_writers import write_nerfstudio
 
 FOCAL, CENTRE = 40.0, (31.0, 24.5)
-
-
-def psnr(image: torch.Tensor, reference: np.ndarray) -> float:
-    return -10 * float(torch.log10(((image.float() - torch.from_numpy(reference).float()) / 255).square().mean()))
-
-
-@pytest.mark.parametrize(("model", "least"), [("OPENCV", 29.0), ("OPENCV_FISHEYE", 29.0)])
-def test_undistorted_photos_are_pinhole_photos(demo, distorted, model, least):
-    """Against photos of the undistorted camera; ignoring the lens would cost at least 4 dB."""
-    scene = load_scene(distorted[model])
-    for view in (scene.train[0], scene.train[5], scene.test[1]):
-        camera = view.camera
-        size = (camera.width, camera.height)
-        undistorted = Lens("PINHOLE", (camera.fx, camera.fy, camera.cx, camera.cy), *size)
-        own = np.array(Image.open(demo / "images" / view.name))
-        photo = photograph(own, demo_lens(demo, "PINHOLE", ()), undistorted)
-        raw = Image.open(distorted[model] / "images" / view.name).resize(size, Image.Resampling.BICUBIC)
-        ignored = psnr(torch.from_numpy(np.array(raw)), photo)
-        assert psnr(view.image, photo) > max(least, ignored + 4) and view.mask is None
-    assert scene.points.shape == (len(load_scene(distorted[model]).points), 3)
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
