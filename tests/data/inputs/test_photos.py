@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image, ImageCms
 
 from nexwarp.data import load_scene
@@ -47,32 +48,16 @@ def png16(file, photo, color=2, alpha=False):
     file.write_bytes(b"\x89PNG\r\n\x1a\n" + body)
 
 
-def tiff(file, photo, dtype="<u1", scale=1.0, photometric=2, kind=1, more=None, packed=None):
-    """Write a TIFF file of `photo` * `scale` in a number type, by hand; `kind` is the tag SampleFormat.
-
-    `more` is the tag ExtraSamples and the value of a further channel; `packed` replaces the content, of 12 bits.
-    """
+def tiff(file, photo, dtype="<u1", scale=1.0, photometric=2, more=None):
+    """Write a TIFF file of `photo` * `scale` in a number type; `more` is the tag and the value of a further channel."""
     values = photo.astype(float) if photometric == 2 else grey(photo)[..., :1]
     values = (65535 if dtype[1:] == "u2" else 255) - values * scale if photometric == 0 else values * scale
     values = values if dtype[1] == "f" else np.round(values)
     if more is not None:
         values = np.concatenate([values, np.full((*values.shape[:2], 1), more[1])], axis=-1)
-    content = values.astype(dtype).tobytes() if packed is None else packed
-    order, count = "<" if dtype[0] == "<" else ">", values.shape[-1]
-    width = 8 * np.dtype(dtype).itemsize if packed is None else 12
-    tags = {256: [room.WIDTH], 257: [room.HEIGHT], 258: [width] * count, 259: [1], 262: [photometric], 273: [0]}
-    tags |= {277: [count], 278: [room.HEIGHT], 279: [len(content)], **({338: [more[0]]} if more else {})}
-    tags[339] = [kind] * count
-    directory, extra, place = b"", b"", 8 + 2 + 12 * len(tags) + 4
-    tags[273] = [place + sum(2 * len(x) for x in tags.values() if len(x) > 2)]
-    for tag, numbers in sorted(tags.items()):
-        short = 3 if max(numbers) < 65536 else 4
-        data = struct.pack(f"{order}{len(numbers)}{'H' if short == 3 else 'I'}", *numbers)
-        if len(data) > 4:
-            data, extra = struct.pack(f"{order}I", place + len(extra)), extra + data
-        directory += struct.pack(f"{order}HHI", tag, short, len(numbers)) + data.ljust(4, b"\0")
-    head = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}IH", 8, len(tags))
-    file.write_bytes(head + directory + bytes(4) + extra + content)
+    options = {} if more is None else {"extrasamples": [more[0]], "planarconfig": 1}
+    values = values.squeeze().astype(dtype)
+    tifffile.imwrite(file, values, byteorder=">" if dtype[0] == ">" else "<", photometric=photometric, **options)
 
 
 def tiff12(file, photo):
@@ -80,7 +65,10 @@ def tiff12(file, photo):
     values = np.round(grey(photo)[..., 0] * (4095 / 255)).astype(int)
     one, two = values[:, ::2], values[:, 1::2]
     packed = np.stack([one >> 4, ((one & 15) << 4) | (two >> 8), two & 255], axis=-1).astype(np.uint8)
-    tiff(file, photo, photometric=1, packed=packed.tobytes())
+    tifffile.imwrite(file, packed.reshape(len(packed), -1))
+    with tifffile.TiffFile(file, mode="r+") as written:
+        written.pages[0].tags["ImageWidth"].overwrite(room.WIDTH)
+        written.pages[0].tags["BitsPerSample"].overwrite(12)
 
 
 def pgm(file, photo, largest):
@@ -173,15 +161,15 @@ KINDS: dict[str, tuple[str, Callable[..., None], Any]] = {
     "tif of 16-bit grey, big-endian": ("tif", partial(tiff, dtype=">u2", scale=257, photometric=1), grey),
     "tif of 16-bit grey, white as 0": ("tif", partial(tiff, dtype="<u2", scale=257, photometric=0), grey),
     "tif of 16-bit RGBA": ("tif", partial(tiff, dtype="<u2", scale=257, more=(2, 30_000)), same),
-    "tif of grey floats": ("tif", partial(tiff, dtype="<f4", scale=1 / 255, photometric=1, kind=3), FLOATS),
-    "tif of grey floats, big-endian": ("tif", partial(tiff, dtype=">f4", scale=1 / 255, photometric=1, kind=3), FLOATS),
-    "tif of floats": ("tif", partial(tiff, dtype="<f4", scale=1 / 255, kind=3), UNKNOWN),
-    "tif of half floats": ("tif", partial(tiff, dtype="<f2", scale=1 / 255, kind=3), UNKNOWN),
-    "tif of doubles": ("tif", partial(tiff, dtype="<f8", scale=1 / 255, photometric=1, kind=3), UNKNOWN),
-    "tif of signed bytes": ("tif", partial(tiff, dtype="<i1", scale=0.4, photometric=1, kind=2), INTEGERS),
-    "tif of signed 16 bits": ("tif", partial(tiff, dtype="<i2", scale=100, photometric=1, kind=2), INTEGERS),
+    "tif of grey floats": ("tif", partial(tiff, dtype="<f4", scale=1 / 255, photometric=1), FLOATS),
+    "tif of grey floats, big-endian": ("tif", partial(tiff, dtype=">f4", scale=1 / 255, photometric=1), FLOATS),
+    "tif of floats": ("tif", partial(tiff, dtype="<f4", scale=1 / 255), UNKNOWN),
+    "tif of half floats": ("tif", partial(tiff, dtype="<f2", scale=1 / 255), UNKNOWN),
+    "tif of doubles": ("tif", partial(tiff, dtype="<f8", scale=1 / 255, photometric=1), UNKNOWN),
+    "tif of signed bytes": ("tif", partial(tiff, dtype="<i1", scale=0.4, photometric=1), INTEGERS),
+    "tif of signed 16 bits": ("tif", partial(tiff, dtype="<i2", scale=100, photometric=1), INTEGERS),
     "tif of 32 bits": ("tif", partial(tiff, dtype="<u4", scale=1e6, photometric=1), INTEGERS),
-    "tif of signed 32 bits": ("tif", partial(tiff, dtype="<i4", scale=1e6, photometric=1, kind=2), INTEGERS),
+    "tif of signed 32 bits": ("tif", partial(tiff, dtype="<i4", scale=1e6, photometric=1), INTEGERS),
     "pfm": ("ppm", pfm, FLOATS),
     "OpenEXR as png": ("png", exr, UNKNOWN),
     "Radiance as jpg": ("jpg", radiance, UNKNOWN),
