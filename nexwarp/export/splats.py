@@ -89,7 +89,7 @@ class Gaussians:
         quats: (M, 4) unit quaternions wxyz, Gaussian to world.
         log_scales: (M, 3) logarithms of the standard deviations, the third thin.
         logit_opacities: (M,)
-        sh: (M, 16, 3) coefficients; those above the given degree are 0.
+        sh: (M, (degree + 1)^2, 3) coefficients.
     """
 
     means: torch.Tensor
@@ -101,14 +101,23 @@ class Gaussians:
 
 
 @torch.no_grad()
-def gaussians(surfels: Surfels, sh_degree: int, cameras: Sequence[Camera], max_extent: float) -> Gaussians:
-    """Return surfels as Gaussians; large ones become several, which come last."""
+def gaussians(
+    surfels: Surfels,
+    sh_degree: int = SPLAT_DEGREE,
+    cameras: Sequence[Camera] = (),
+    max_extent: float = MAX_EXTENT,
+) -> Gaussians:
+    """Return surfels as Gaussians of SH degree 0 to 3, without the texture and with gamma = 1.
+
+    Each surfel becomes a flat Gaussian, whose third scale is a thousandth of the smaller of the other two, or several
+    of them, which come last: a scale is at most `max_extent` of the distance to the nearest of the cameras.
+    """
     raw = surfels.state_dict()
     pieces = split_large(surfels.means, surfels.scales, surfels.opacities, cameras, max_extent)
     ids, whole = pieces.ids, pieces.whole
     means = raw["means"][ids]
     means[whole:] = points_on(surfels, ids[whole:], pieces.offsets[whole:])
-    sh = raw["sh0"].new_zeros(len(surfels), (SPLAT_DEGREE + 1) ** 2, 3)
+    sh = raw["sh0"].new_zeros(len(surfels), (sh_degree + 1) ** 2, 3)
     kept = torch.cat([raw["sh0"], raw["shN"]], dim=1)[:, : (sh_degree + 1) ** 2]
     sh[:, : kept.shape[1]] = kept
     scales = torch.cat([raw["log_scales"][ids[:whole]], pieces.scales[whole:].log()])
@@ -117,32 +126,21 @@ def gaussians(surfels: Surfels, sh_degree: int, cameras: Sequence[Camera], max_e
     return Gaussians(means, surfels.normals[ids], surfels.quats[ids], torch.cat([scales, thin], 1), logits, sh[ids])
 
 
-def save_splats_ply(
-    path: str | os.PathLike[str],
-    surfels: Surfels,
-    sh_degree: int = SPLAT_DEGREE,
-    *,
-    cameras: Sequence[Camera] = (),
-    max_extent: float = MAX_EXTENT,
-) -> None:
-    """Write surfels as Gaussians for viewers of 3D Gaussian splatting, without the texture and with gamma = 1.
-
-    Each surfel becomes a flat Gaussian, whose third scale is a thousandth of the smaller of the other two, or several
-    of them, which come last: a scale is at most `max_extent` of the distance to the nearest of the cameras. SH above
-    `sh_degree`, 0 to 3, are 0.
+def save_splats_ply(path: str | os.PathLike[str], splats: Gaussians) -> None:
+    """Write Gaussians for viewers of 3D Gaussian splatting; SH above their degree are 0.
 
     Properties: `x y z`, `nx ny nz`, `f_dc_0..2`, `f_rest_0..44`, `opacity` (logit), `scale_0..2` (logarithms),
     `rot_0..3` (wxyz, unit), all float32.
     """
-    found = gaussians(surfels, sh_degree, cameras, max_extent)
+    missing = (SPLAT_DEGREE + 1) ** 2 - splats.sh.shape[1]
     groups = {
-        "x y z": found.means,
-        "nx ny nz": found.normals,
-        "f_dc": found.sh[:, 0],
-        "f_rest": found.sh[:, 1:].mT.flatten(1),
-        "opacity": found.logit_opacities,
-        "scale": found.log_scales,
-        "rot": found.quats,
+        "x y z": splats.means,
+        "nx ny nz": splats.normals,
+        "f_dc": splats.sh[:, 0],
+        "f_rest": torch.nn.functional.pad(splats.sh[:, 1:].mT, (0, missing)).flatten(1),
+        "opacity": splats.logit_opacities,
+        "scale": splats.log_scales,
+        "rot": splats.quats,
     }
     columns = _columns({name: values.float() for name, values in groups.items()})
     write_elements(path, {"vertex": columns}, SPLATS)
@@ -158,35 +156,26 @@ def _columns(groups: Mapping[str, torch.Tensor]) -> dict[str, np.ndarray]:
     return columns
 
 
-def save_splats_glb(
-    path: str | os.PathLike[str],
-    surfels: Surfels,
-    sh_degree: int = SPLAT_DEGREE,
-    *,
-    cameras: Sequence[Camera] = (),
-    max_extent: float = MAX_EXTENT,
-) -> None:
-    """Write the Gaussians of `save_splats_ply`, whose arguments these are, as glTF with KHR_gaussian_splatting.
+def save_splats_glb(path: str | os.PathLike[str], splats: Gaussians, cameras: Sequence[Camera]) -> None:
+    """Write Gaussians as glTF with KHR_gaussian_splatting.
 
     The file is binary glTF 2.0: one primitive of points, which programs without the extension show in the colours of
-    COLOR_0. The mean of the cameras' upward directions becomes +y, by the node. FormatError: there are no surfels.
+    COLOR_0. The mean of the cameras' upward directions becomes +y, by the node. FormatError: there are no Gaussians.
     """
-    if not len(surfels):
-        raise FormatError(f"{path}: expected surfels to write, the model has none")
-    found = gaussians(surfels, sh_degree, cameras, max_extent)
-    opacities = found.logit_opacities.sigmoid()
-    display = (BAND_0 * found.sh[:, 0] + 0.5).clamp(0, 1)
+    _check_any(path, splats)
+    opacities = splats.logit_opacities.sigmoid()
+    display = (BAND_0 * splats.sh[:, 0] + 0.5).clamp(0, 1)
     linear = torch.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
     attributes = {
-        "POSITION": found.means,
+        "POSITION": splats.means,
         "COLOR_0": torch.cat([linear, opacities[:, None]], dim=1),
-        f"{SPLATTING}:ROTATION": found.quats.roll(-1, 1),  # xyzw
-        f"{SPLATTING}:SCALE": found.log_scales.exp(),
+        f"{SPLATTING}:ROTATION": splats.quats.roll(-1, 1),  # xyzw
+        f"{SPLATTING}:SCALE": splats.log_scales.exp(),
         f"{SPLATTING}:OPACITY": opacities,
     }
-    for degree in range(sh_degree + 1):
-        for n in range(2 * degree + 1):
-            attributes[f"{SPLATTING}:SH_DEGREE_{degree}_COEF_{n}"] = found.sh[:, degree**2 + n]
+    for index, coefficients in enumerate(splats.sh.unbind(1)):
+        degree = math.isqrt(index)
+        attributes[f"{SPLATTING}:SH_DEGREE_{degree}_COEF_{index - degree**2}"] = coefficients
     arrays = {name: values.float().cpu().contiguous().numpy() for name, values in attributes.items()}
     kinds = {(): "SCALAR", (3,): "VEC3", (4,): "VEC4"}
     accessors, views, offset = [], [], 0
@@ -218,15 +207,8 @@ def save_splats_glb(
     write_atomically(Path(path), b"".join([header, *chunks, *(array.tobytes() for array in arrays.values())]))
 
 
-def save_splats_spz(
-    path: str | os.PathLike[str],
-    surfels: Surfels,
-    sh_degree: int = SPLAT_DEGREE,
-    *,
-    cameras: Sequence[Camera] = (),
-    max_extent: float = MAX_EXTENT,
-) -> None:
-    """Write the Gaussians of `save_splats_ply`, whose arguments these are, as an SPZ file.
+def save_splats_spz(path: str | os.PathLike[str], splats: Gaussians) -> None:
+    """Write Gaussians as an SPZ file.
 
     Positions have steps of 2^-24 world units, or 2^-22 of the farthest coordinate; 1/4096 units where few
     Gaussians are farther than 2,047 units from the origin, which are left out. UserWarning where more than 1 % of the
@@ -234,16 +216,15 @@ def save_splats_spz(
     """
     import gaussforge
 
-    if not len(surfels):
-        raise FormatError(f"{path}: expected surfels to write, the model has none")
+    _check_any(path, splats)
     with tempfile.TemporaryDirectory() as folder:
         ply = Path(folder) / "splats.ply"
-        save_splats_ply(ply, surfels, sh_degree, cameras=cameras, max_extent=max_extent)
+        save_splats_ply(ply, splats)
         content = ply.read_bytes()
     library = gaussforge.GaussForge()
-    gaussians = _checked(path, library.read(content, "ply"))
-    count = gaussians["numPoints"]
-    arrays = {name: np.frombuffer(gaussians[name], np.float32).reshape(count, -1) for name in ARRAYS}
+    data = _checked(path, library.read(content, "ply"))
+    count = data["numPoints"]
+    arrays = {name: np.frombuffer(data[name], np.float32).reshape(count, -1) for name in ARRAYS}
     reach = np.abs(arrays["positions"]).max(axis=1)
     shift = _shift(float(reach.max()))
     if shift < 0 and (reach >= LARGEST_COORDINATE).mean() <= LARGEST_LOSS:
@@ -263,10 +244,15 @@ def save_splats_spz(
             stacklevel=2,
         )
     arrays["positions"] = arrays["positions"] * np.float32(2.0**shift)
-    gaussians |= {name: array[near].tobytes() for name, array in arrays.items()} | {"numPoints": int(near.sum())}
-    packed = bytearray(gzip.decompress(_checked(path, library.write(gaussians, "spz"))))
+    data |= {name: array[near].tobytes() for name, array in arrays.items()} | {"numPoints": int(near.sum())}
+    packed = bytearray(gzip.decompress(_checked(path, library.write(data, "spz"))))
     packed[FRACTION_BYTE] += shift
     write_atomically(Path(path), gzip.compress(packed, mtime=0))
+
+
+def _check_any(path: str | os.PathLike[str], splats: Gaussians) -> None:
+    if not len(splats.means):
+        raise FormatError(f"{path}: expected surfels to write, the model has none")
 
 
 def _shift(farthest: float) -> int:

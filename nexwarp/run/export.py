@@ -28,6 +28,7 @@ from nexwarp.export.mesh import extract_mesh, save_mesh
 from nexwarp.export.splats import (
     MAX_EXTENT,
     SPLAT_DEGREE,
+    gaussians,
     save_splats_glb,
     save_splats_ply,
     save_splats_spz,
@@ -46,7 +47,6 @@ from nexwarp.train.recipe import MASK_MODES
 
 # Packages that formats need, and their extras.
 PACKAGES = {"glb": ("trimesh", "glb"), "spz": ("gaussforge", "splats"), "usd": ("pxr", "usd")}
-SPLAT_WRITERS = {"ply": save_splats_ply, "spz": save_splats_spz, "gltf-splats": save_splats_glb}
 RENDERED = ("mesh", "web", "glb", "usd")  # formats that are made of renderings, stage by stage
 BAKED = ("web", "glb", "usd")  # formats whose texture is baked, and fitted to photos
 READ = ("web", "glb")  # of these, those that can be read back
@@ -199,7 +199,13 @@ def _export_geometry(
         return
     if order.format == "ply":
         save_surfels_ply(files[0], surfels)
-    SPLAT_WRITERS[order.format](files[-1], surfels, degree, cameras=moved, max_extent=order.max_extent)
+    splats = gaussians(surfels, degree, moved, order.max_extent)
+    if order.format == "gltf-splats":
+        save_splats_glb(files[-1], splats, moved)
+    elif order.format == "spz":
+        save_splats_spz(files[-1], splats)
+    else:
+        save_splats_ply(files[-1], splats)
 
 
 def _photos(opened: OpenedModel, observe: Progress) -> tuple[list[View], list[View]]:

@@ -12,7 +12,7 @@ import nexwarp as nw
 from nexwarp.cameras.similarity import upright
 from nexwarp.export.bake import Baked, bake, evaluate, lay_out, observe
 from nexwarp.export.glb import CUTOFF, make_cards, save_glb
-from nexwarp.export.splats import save_splats_spz
+from nexwarp.export.splats import gaussians, save_splats_spz
 from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE, encode_atlas, encode_baked, encode_harmonics
 from tests.export.web import support
 from tests.export.web.support import as_stored, psnr, rendered, ring
@@ -147,7 +147,7 @@ def test_spz_files_hold_the_gaussians(model, tmp_path, unit):
     with torch.no_grad():
         surfels.means *= unit
         surfels.log_scales.clamp_(-9.9, 5.9)
-    save_splats_spz(tmp_path / "a.spz", surfels)
+    save_splats_spz(tmp_path / "a.spz", gaussians(surfels))
     found = library.read((tmp_path / "a.spz").read_bytes(), "spz")["data"]
     positions, colors, alphas = (np.frombuffer(found[name], np.float32) for name in ("positions", "colors", "alphas"))
     means = surfels.means.detach().numpy()
@@ -163,11 +163,11 @@ def test_what_spz_cannot_hold_is_said(model, tmp_path):
     with torch.no_grad():
         surfels.log_scales.fill_(-12.0)
     with pytest.warns(UserWarning, match=r"SPZ holds scales from 4.5e-05 to 379 units; .* change their size"):
-        save_splats_spz(tmp_path / "a.spz", surfels)
+        save_splats_spz(tmp_path / "a.spz", gaussians(surfels))
     empty = nw.Surfels.from_activated(*(torch.zeros(0, *shape) for shape in ((3,), (4,), (2,), (), (2,), (16, 3))))
     with pytest.raises(ValueError, match="expected surfels to write, the model has none"):
-        save_splats_spz(tmp_path / "b.spz", empty)
+        save_splats_spz(tmp_path / "b.spz", gaussians(empty))
     with torch.no_grad():
         surfels.means[:] *= 1e9
     with pytest.raises(ValueError, match="SPZ holds Gaussians up to 8,384,512 units from the origin"):
-        save_splats_spz(tmp_path / "b.spz", surfels)
+        save_splats_spz(tmp_path / "b.spz", gaussians(surfels))

@@ -16,6 +16,7 @@ from nexwarp.export.splats import (
     SPLATTING,
     THINNESS,
     Pieces,
+    gaussians,
     save_splats_glb,
     save_splats_ply,
     save_surfels_ply,
@@ -84,7 +85,7 @@ def test_surfels_read_back_bit_for_bit(
 @pytest.mark.parametrize("kept", [0, 2, 3])
 def test_splats_are_flat_gaussians(tmp_path: Path, given: int, kept: int) -> None:
     scene = random_scene(sh_degree=given)
-    save_splats_ply(tmp_path / "a.ply", make_surfels(scene), kept)
+    save_splats_ply(tmp_path / "a.ply", gaussians(make_surfels(scene), kept))
     columns = read(tmp_path / "a.ply")
     rest = numbered("f_rest", 45)
     assert list(columns) == [*PLACE, *rest, "opacity", *numbered("scale", 3), *numbered("rot", 4)]
@@ -106,8 +107,9 @@ def test_splats_are_flat_gaussians(tmp_path: Path, given: int, kept: int) -> Non
 def test_gltf_holds_the_gaussians_of_the_ply(tmp_path: Path, degree: int) -> None:
     """By the ratified KHR_gaussian_splatting: linear scales, opacities in [0, 1], quaternions xyzw."""
     surfels = make_surfels(random_scene(sh_degree=3))
-    save_splats_ply(tmp_path / "a.ply", surfels, degree, cameras=[CAMERA])
-    save_splats_glb(tmp_path / "a.glb", surfels, degree, cameras=[CAMERA])
+    splats = gaussians(surfels, degree, [CAMERA])
+    save_splats_ply(tmp_path / "a.ply", splats)
+    save_splats_glb(tmp_path / "a.glb", splats, [CAMERA])
     columns, content = read(tmp_path / "a.ply"), (tmp_path / "a.glb").read_bytes()
     assert struct.unpack_from("<4sII", content) == (b"glTF", 2, len(content))
     length, kind = struct.unpack_from("<I4s", content, 12)
@@ -145,7 +147,7 @@ def test_gltf_holds_the_gaussians_of_the_ply(tmp_path: Path, degree: int) -> Non
     linear = (found["COLOR_0"][:, :3] - shown.pow(2.2)).abs()
     assert linear.max() < 0.01 and found["COLOR_0"][:, 3:].equal(found["OPACITY"])
     with pytest.raises(FormatError, match="expected surfels"):
-        save_splats_glb(tmp_path / "none.glb", make_surfels(random_scene(0)))
+        save_splats_glb(tmp_path / "none.glb", gaussians(make_surfels(random_scene(0))), [CAMERA])
 
 
 # Large surfels become several Gaussians
@@ -178,10 +180,10 @@ def test_small_surfels_and_those_of_no_camera_stay_one_gaussian(tmp_path: Path) 
     with torch.no_grad():
         surfels.log_scales.fill_(-9.0)
         surfels.log_scales[::3] = 1.0
-    save_splats_ply(tmp_path / "none.ply", surfels)
-    save_splats_ply(tmp_path / "inf.ply", surfels, cameras=[CAMERA], max_extent=float("inf"))
+    save_splats_ply(tmp_path / "none.ply", gaussians(surfels))
+    save_splats_ply(tmp_path / "inf.ply", gaussians(surfels, 3, [CAMERA], float("inf")))
     assert (tmp_path / "none.ply").read_bytes() == (tmp_path / "inf.ply").read_bytes()
-    save_splats_ply(tmp_path / "split.ply", surfels, cameras=[CAMERA])
+    save_splats_ply(tmp_path / "split.ply", gaussians(surfels, 3, [CAMERA]))
     one, several = read(tmp_path / "none.ply"), read(tmp_path / "split.ply")
     kept = torch.exp(one["scale_0"]) < 1
     count = int(kept.sum())
@@ -206,7 +208,7 @@ def test_an_affine_renderer_shows_large_surfels_as_we_do(tmp_path: Path) -> None
         mine = nw.render(surfels, None, camera, background=(0.2, 0.5, 0.8)).image
     found = []
     for extent in (float("inf"), 0.1):
-        save_splats_ply(tmp_path / "a.ply", surfels, cameras=[camera], max_extent=extent)
+        save_splats_ply(tmp_path / "a.ply", gaussians(surfels, 3, [camera], extent))
         columns = {name: x.double() for name, x in read(tmp_path / "a.ply").items()}
         theirs = ewa.render(
             stack(columns, "x", "y", "z"),
@@ -224,9 +226,10 @@ def test_an_affine_renderer_shows_large_surfels_as_we_do(tmp_path: Path) -> None
 def test_what_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
     surfels = make_surfels(random_scene(4))
     (tmp_path / "file").touch()
-    for save in (save_surfels_ply, save_splats_ply):
-        with pytest.raises(OSError, match="file"):
-            save(tmp_path / "file" / "a.ply", surfels)
+    with pytest.raises(OSError, match="file"):
+        save_surfels_ply(tmp_path / "file" / "a.ply", surfels)
+    with pytest.raises(OSError, match="file"):
+        save_splats_ply(tmp_path / "file" / "a.ply", gaussians(surfels))
     assert [f.name for f in tmp_path.iterdir()] == ["file"]
 
 

@@ -28,7 +28,7 @@ from nexwarp.data.sfm.photos import camera_groups, read_photos
 from nexwarp.export.bake import bake
 from nexwarp.export.baked_scene import load_baked
 from nexwarp.export.glb import make_cards, save_glb
-from nexwarp.export.splats import save_splats_ply
+from nexwarp.export.splats import gaussians, save_splats_ply
 from nexwarp.export.web.baked import encode_baked
 from nexwarp.io.json_files import write_json
 from nexwarp.io.pictures import load_exr, save_exr
@@ -112,7 +112,7 @@ def _ply(folder: Path) -> list[Files]:
     numbers = np.arange(18.0).reshape(6, 3)
     for form in ("ascii", "binary_little_endian", "binary_big_endian"):
         write_points(folder / form, 0.1 * numbers, numbers.astype(np.uint8), form)
-    save_splats_ply(folder / "splats", make_surfels(random_scene(5)))
+    save_splats_ply(folder / "splats", gaussians(make_surfels(random_scene(5))))
     return [{"points.ply": data} for data in _files(folder).values()]
 
 
