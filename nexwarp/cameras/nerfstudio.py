@@ -75,24 +75,6 @@ def save_transforms(
     write_atomically(Path(path), (json.dumps(data, indent=2) + "\n").encode())
 
 
-def load_transforms(
-    path: str | os.PathLike[str], near: float = 0.01, origin: tuple[float, float, float] = WORLD
-) -> dict[str, Camera]:
-    """Read the cameras of a `transforms.json`, by the names of their images, as pinholes without distortion.
-
-    They are float32 on the CPU, in the order of the file, with the near depth `near` in world units, in the frame
-    whose origin has the world coordinates `origin`, such as `Model.origin`. The images need not exist. Intrinsics are
-    those of the frame, else those of the file: `fl_x`, `fl_y` or `camera_angle_x`, `camera_angle_y`; `cx`, `cy`
-    (default: the image centre); `w`, `h`.
-
-    Raises:
-        FileNotFoundError: no such file. ValueError: a key is missing or has an invalid value; the message names the
-            frame and key.
-    """
-    path = Path(path)
-    return _frames(path, _read(path), near, origin)
-
-
 def save_camera_path(path: str | os.PathLike[str], cameras: Sequence[Camera], fps: float = 30.0) -> None:
     """Write a camera path in nerfstudio's format, for `ns-render camera-path` and `nexwarp render --path`, atomically.
 
@@ -141,12 +123,19 @@ def load_camera_path(
 ) -> CameraPath:
     """Read a camera path: nerfstudio's (key `camera_path`), or the frames of a `transforms.json` in their order.
 
-    `near` and `origin` are those of `load_transforms`, whose errors it raises, too.
+    The cameras are float32 on the CPU, with the near depth `near` in world units, in the frame whose origin has the
+    world coordinates `origin`, such as `Model.origin`. Frames are pinholes without distortion, whose images need not
+    exist. Their intrinsics are those of the frame, else those of the file: `fl_x`, `fl_y` or `camera_angle_x`,
+    `camera_angle_y`; `cx`, `cy` (default: the image centre); `w`, `h`.
+
+    Raises:
+        FileNotFoundError: no such file. ValueError: a key is missing or has an invalid value; the message names the
+            frame and key.
     """
     path = Path(path)
     data = _read(path)
     if "camera_path" not in data and "frames" in data:
-        return CameraPath(list(_frames(path, data, near, origin).values()), None)
+        return CameraPath(_frames(path, data, near, origin), None)
     if "camera_path" not in data:
         keys = ", ".join(sorted(data)[:8]) or "none"
         raise FormatError(f"{path}: expected the key camera_path or frames, found {one_line(keys)}")
@@ -168,7 +157,7 @@ def load_camera_path(
     return CameraPath(cameras, fps)
 
 
-def _frames(path: Path, data: JsonObject, near: float, origin: tuple[float, float, float]) -> dict[str, Camera]:
+def _frames(path: Path, data: JsonObject, near: float, origin: tuple[float, float, float]) -> list[Camera]:
     model = data.get("camera_model", "PINHOLE")
     if model not in PINHOLES:
         raise FormatError(f"{path}: camera_model: expected one of {', '.join(PINHOLES)}, got {model!r:.60}")
@@ -187,7 +176,7 @@ def _frames(path: Path, data: JsonObject, near: float, origin: tuple[float, floa
         if name in cameras:
             raise ValueError(f"{where}.file_path: expected a name of its own, got {name!r} again")
         cameras[name] = _camera(where, undo @ pose, intrinsics, (width, height), near, origin)
-    return cameras
+    return list(cameras.values())
 
 
 def _camera_to_world(camera: Camera) -> torch.Tensor:

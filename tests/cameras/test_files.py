@@ -10,7 +10,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
-from nexwarp.cameras.nerfstudio import load_camera_path, load_transforms, save_camera_path, save_transforms
+from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
 from nexwarp.cameras.paths import look_at
 from tests.model_file_support import refused
 from tests.scenes import intrinsics, make_camera, random_scene, rigid
@@ -39,15 +39,11 @@ def test_transforms_come_back(tmp_path: Path) -> None:
     before["images/large.png"] = Camera(torch.eye(4), intrinsics(700, 690, 401.5, 299).float(), 800, 600, near=0.1)
     names = list(before)
     save_transforms(tmp_path / "new" / "transforms.json", before, train=names[1:], test=names[:1])
-    after = load_transforms(tmp_path / "new" / "transforms.json", near=0.1)
-    assert list(after) == names
-    for name in names:
-        assert_same(after[name], before[name])
+    after = load_camera_path(tmp_path / "new" / "transforms.json", 0.1)
+    for mine, theirs in zip(after.cameras, before.values(), strict=True):
+        assert_same(mine, theirs)
     data = json.loads((tmp_path / "new" / "transforms.json").read_text())
     assert data["train_filenames"] == names[1:] and data["val_filenames"] == data["test_filenames"] == names[:1]
-    path = load_camera_path(tmp_path / "new" / "transforms.json", 0.1)
-    for mine, theirs in zip(path.cameras, before.values(), strict=True):
-        assert_same(mine, theirs)
 
 
 @pytest.mark.parametrize("centred", [True, False])
@@ -107,11 +103,11 @@ def test_a_file_of_nerfstudios_viewer(tmp_path: Path) -> None:
 
 def test_intrinsics_stand_in_the_file_or_the_frame(tmp_path: Path) -> None:
     frames = [FRAME, FRAME | {"file_path": "b.png", "fl_x": 70.0, "fl_y": 71.0, "cx": 3.5, "w": 100}]
-    a, b = load_transforms(written(tmp_path, SCENE | {"frames": frames})).values()
+    a, b = load_camera_path(written(tmp_path, SCENE | {"frames": frames})).cameras
     assert (a.fx, a.fy, a.cx, a.cy, a.width, a.height) == (50, 50, 32, 24, 64, 48)
     assert (b.fx, b.fy, b.cx, b.cy, b.width, b.height) == (70, 71, 3.5, 24, 100, 48)
     blender = {"camera_angle_x": math.pi / 2, "w": 64, "h": 48, "frames": [FRAME]}
-    (c,) = load_transforms(written(tmp_path, blender)).values()
+    (c,) = load_camera_path(written(tmp_path, blender)).cameras
     assert c.fx == c.fy == pytest.approx(32.0)
 
 
@@ -125,8 +121,8 @@ def test_applied_transform_and_scale_are_taken_back(tmp_path: Path) -> None:
         pose[:3, 3] *= 0.25
         frame["transform_matrix"] = pose.tolist()
     data |= {"applied_transform": applied[:3].tolist(), "applied_scale": 0.25}
-    for name, each in load_transforms(written(tmp_path, data), near=0.1).items():
-        assert_same(each, before[name])
+    for mine, theirs in zip(load_camera_path(written(tmp_path, data), near=0.1).cameras, before.values(), strict=True):
+        assert_same(mine, theirs)
 
 
 def entry(**changes: Any) -> dict[str, Any]:
@@ -143,6 +139,8 @@ BAD = [
     (PATH | {"camera_path": [3]}, r"camera_path\[0\]: expected a JSON object, got 3"),
     (PATH | {"camera_type": "fisheye"}, "camera_type: expected perspective, got 'fisheye'"),
     (PATH | {"render_width": 0}, "render_width: expected a number above 0, got 0"),
+    (PATH | {"render_width": 10**400}, "render_width: expected a number"),
+    (PATH | {"render_width": 10**9}, "render_width: expected at most 65536 pixels, got 1e"),
     (PATH | {"render_height": 10.5}, "render_height: expected a whole number of pixels, got 10.5"),
     (PATH | {"fps": "fast"}, "fps: expected a number above 0, got 'fast'"),
     (entry(fov=None), r"camera_path\[1\]: expected the key fov, found none"),
@@ -150,6 +148,8 @@ BAD = [
     (entry(camera_to_world=None), r"camera_path\[1\]: expected the key camera_to_world, found none"),
     (entry(camera_to_world=SINGULAR), r"camera_path\[1\]: camera_to_world: expected an invertible pose, got the sing"),
     (entry(camera_to_world=[0.0] * 16), r"camera_path\[1\]: camera_to_world: expected the last row 0, 0, 0, 1"),
+    (entry(camera_to_world=[10**400, *FLAT[1:]]), r"camera_path\[1\]: camera_to_world: expected a 4x4 matrix of"),
+    (entry(camera_to_world=[[1, 2], [3]]), r"camera_path\[1\]: camera_to_world: expected a 4x4 matrix of numbers"),
     (entry(camera_to_world=[1.0] * 9), r"camera_path\[1\]: camera_to_world: expected a 4x4 matrix of numbers"),
     (entry(camera_to_world="eye"), r"camera_path\[1\]: camera_to_world: expected a 4x4 matrix of numbers, got eye"),
     (entry(camera_to_world=[math.nan, *FLAT[1:]]), r"camera_path\[1\]: camera_to_world: expected finite numbers"),
@@ -213,7 +213,7 @@ ROWS = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 
 K = [[9.0, 0.0, 4.0], [0.0, 9.0, 3.0], [0.0, 0.0, 1.0]]
 CAMERA: dict[str, object] = {"viewmat": ROWS, "K": K, "width": 8, "height": 6}
 NEAR = CAMERA | {"near": 0.1}
-MATRICES = (ROWS[:3], "text", [[float("nan")] * 4] * 4)
+MATRICES = (ROWS[:3], "text", [[float("nan")] * 4] * 4, [[10**400]])
 
 
 @pytest.mark.parametrize(

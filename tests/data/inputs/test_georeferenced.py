@@ -8,7 +8,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.cameras.camera import Camera
-from nexwarp.cameras.nerfstudio import load_camera_path, load_transforms
+from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.cli import main as cli
 from nexwarp.data import load_scene
 from tests.cli.support import FLAGS
@@ -131,7 +131,7 @@ def test_a_model_says_its_frame_and_exports_cameras_of_the_world(tmp_path):
         centre = UTM - viewmat[:3, :3].T @ viewmat[:3, 3]
         np.testing.assert_allclose(np.array(frame["transform_matrix"])[:3, 3], centre, rtol=0, atol=1e-6)
     paths = load_camera_path(run / "export" / "camera_path.json", origin=origin).cameras
-    given = load_transforms(run / "export" / "transforms.json", origin=origin).values()
+    given = load_camera_path(run / "export" / "transforms.json", origin=origin).cameras
     for camera, one, other in zip((named[name] for name in names), paths, given, strict=True):
         torch.testing.assert_close(one.viewmat, camera.viewmat, rtol=0, atol=1e-6)
         torch.testing.assert_close(other.viewmat, camera.viewmat, rtol=0, atol=1e-6)

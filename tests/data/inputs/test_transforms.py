@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from nexwarp.cameras.nerfstudio import load_transforms
+from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.data import load_scene
 from tests.data.inputs import room
 from tests.data.test_scene import views_of
@@ -58,7 +58,7 @@ def test_intrinsics_of_frames_and_files(tmp_path, kind):
         camera = view.camera
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(pinhole, rel=1e-6)
     if keys.get("w", 64) is not None:
-        read = next(iter(load_transforms(path / "transforms.json").values()))
+        read = load_camera_path(path / "transforms.json").cameras[0]
         assert (read.fx, read.fy, read.cx, read.cy) == pytest.approx(pinhole, rel=1e-6), "as a camera path"
 
 
