@@ -1,8 +1,6 @@
 """Bad scenes are one clear line."""
 
 import json
-import struct
-import zlib
 
 import numpy as np
 import pytest
@@ -33,18 +31,10 @@ def mask_of(width: int, height: int, value: int = 255):
     return make
 
 
-def header_only(width: int, height: int) -> bytes:
-    """A PNG that says it is large and holds nothing."""
-    chunk = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    start = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    return start + b"\0\0\0\0IDAT" + struct.pack(">I", zlib.crc32(b"IDAT"))
-
-
 def keys(**changes):
     return spoilt(lambda data: data.update(changes))
 
 
-ROWS = np.eye(4).tolist()
 DOUBLE = (2 * np.eye(4)).tolist()
 SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
 BAD = {
@@ -67,14 +57,8 @@ BAD = {
     "backslashes": (frame(file_path="images\\..\\..\\x.png"), "leaves the scene's folder"),
     "zero byte": (frame(file_path="images/\0.png"), "leaves the scene's folder"),
     "no matrix": (frame(transform_matrix=None), "frame 3 .*: transform_matrix: expected a 4x4 matrix .*, got None"),
-    "short matrix": (frame(transform_matrix=ROWS[:2]), "expected a 4x4 matrix of numbers"),
-    "ragged matrix": (frame(transform_matrix=[[1, 2], *ROWS[1:]]), "expected a 4x4 matrix of numbers"),
-    "text matrix": (frame(transform_matrix=[["1", 0, 0, 0], *ROWS[1:]]), "expected a 4x4 matrix of numbers"),
-    "infinite matrix": (frame(transform_matrix=[[1e999, 0, 0, 0], *ROWS[1:]]), "Infinity is no JSON|expected finite"),
-    "large whole number": (frame(transform_matrix=[[10**400, 0, 0, 0], *ROWS[1:]]), "expected a 4x4 matrix"),
     "singular matrix": (frame(transform_matrix=SINGULAR), "expected an invertible pose, got the singular"),
     "scaled matrix": (frame(transform_matrix=DOUBLE), "last row 0, 0, 0, 1|singular, sheared, scaled"),
-    "projective matrix": (frame(transform_matrix=[*ROWS[:3], [0, 0, 1, 1]]), "the last row 0, 0, 0, 1"),
     "singular applied": (keys(applied_transform=SINGULAR), "applied_transform: .* got the singular"),
     "applied scale of 0": (keys(applied_scale=0), "applied_scale: expected a number above 0"),
     "endless applied scale": (keys(applied_scale=1e200), "applied_scale: expected a number above 0, got 1e[+]200"),
@@ -102,12 +86,6 @@ BAD = {
     "mask that is none": (file("q.png", b"GIF", mask_path="q.png"), "q.png: expected a complete image file"),
     "mask of another size": (mask_of(72, 96), "view_003.png: expected a mask of 96x72 pixels .* got 72x96"),
     "black mask": (mask_of(96, 72, 0), "view_003.png: expected a mask with pixels that count, got none"),
-    "bomb": (
-        file("images/view_003.png", header_only(60_000, 60_000)),
-        "view_003.png: expected .* megapixels, got",
-    ),
-    "cut-off photo": (file("images/view_003.png", header_only(96, 72)), "view_003.png: expected a complete image file"),
-    "mask bomb": (file("q.png", header_only(60_000, 60_000), mask_path="q.png"), "q.png: expected .* megapixels"),
 }
 
 
