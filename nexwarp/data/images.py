@@ -142,27 +142,19 @@ def is_turned(path: Path) -> bool:
 
 @contextmanager
 def _loaded(path: Path, upright: bool = False) -> Iterator["PIL.Image.Image"]:
-    """Open an image and decode its pixels, as stored or upright. PIL turns TIFF files, and no others, upright."""
-    from PIL.Image import Transpose
+    """Open an image and decode its pixels, as stored or upright."""
+    from PIL import ImageOps
 
     with _opened(path) as image:
-        orientation, is_upright = _orientation(image), hasattr(image, "tag_v2")
+        turned = upright and _orientation(image) != 1
+        if not turned:
+            with suppress(*EXIF_ERRORS):
+                image.getexif().pop(ORIENTATION, None)  # by which PIL turns TIFF files, and no others
         image.load()
-        to_upright = {
-            2: Transpose.FLIP_LEFT_RIGHT,
-            3: Transpose.ROTATE_180,
-            4: Transpose.FLIP_TOP_BOTTOM,
-            5: Transpose.TRANSPOSE,
-            6: Transpose.ROTATE_270,
-            7: Transpose.TRANSVERSE,
-            8: Transpose.ROTATE_90,
-        }
-        if not upright:  # the inverse; only a quarter turn is not its own
-            orientation = {6: 8, 8: 6}.get(orientation, orientation)
-        turn = None if is_upright == upright else to_upright.get(orientation)
-        turned = image if turn is None else image.transpose(turn)
+        if turned:
+            ImageOps.exif_transpose(image, in_place=True)
         tags = getattr(image, "tag_v2", {})
-        yield _full_range(turned, tags.get(BITS, (16,))[0], tags.get(PHOTOMETRIC) == WHITE_IS_ZERO)
+        yield _full_range(image, tags.get(BITS, (16,))[0], tags.get(PHOTOMETRIC) == WHITE_IS_ZERO)
 
 
 def _full_range(image: "PIL.Image.Image", bits: int, inverted: bool) -> "PIL.Image.Image":
