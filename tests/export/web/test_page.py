@@ -200,7 +200,7 @@ def test_controls_modes_links_and_sizes(tab):
 def test_each_renderer_turns_to_the_surfel_of_a_double_click(open_tab, renderer):
     tab = open_tab(webgpu=True)
     tab.open(f"?renderer={renderer}")
-    assert {"baked": "baked", "webgpu": "exact"}[renderer] in tab.page.inner_text("#status")
+    assert {"baked": "baked", "webgpu": "neural"}[renderer] in tab.page.inner_text("#status")
     hits = tab.value("""(async () => {
         const {width, height} = nexwarp.canvas, hits = [];
         for (let y = 8; y < height; y += 16) for (let x = 8; x < width; x += 16) {
@@ -215,7 +215,79 @@ def test_each_renderer_turns_to_the_surfel_of_a_double_click(open_tab, renderer)
     tab.wait(f"Math.hypot(...{TARGET}.map((x, i) => x - {position}[i])) < 0.01 * Math.hypot(...{position})")
     # Software draws the baked scene faster: without a wish, the page takes it.
     tab.open()
-    assert "baked" in tab.page.inner_text("#status") and not tab.errors
+    assert "baked, WebGL · the default on this kind" in tab.page.inner_text("#status") and not tab.errors
+
+
+def test_the_surfels_colours_are_shown_before_the_texture(tab):
+    tab.page.add_init_script("""
+        const request = window.fetch, wait = new Promise(done => (window.release = done));
+        window.fetch = async (...all) => (String(all[0]).includes("atlas") && (await wait), request(...all));
+    """)
+    tab.page.goto(f"{URL}?renderer=baked")
+    early = FINISHED.replace("ready", "preview")
+    tab.wait(early)
+    preview = tab.picture()
+    tab.value("nexwarp.setMode('plain')")
+    tab.wait(early)
+    assert np.array_equal(tab.picture(), preview) and preview.std() > 0.05
+    tab.value("nexwarp.setMode('image')")
+    tab.value("release()")
+    tab.wait(FINISHED)
+    assert np.abs(tab.picture() - preview).mean() > 0.01 and not tab.errors
+
+
+# The adapter calls itself a large GPU; its devices know better. A frame is said to take so long.
+LARGE_GPU = """
+    const request = navigator.gpu.requestAdapter.bind(navigator.gpu);
+    const own = (real, name) => typeof real[name] === "function" ? real[name].bind(real) : real[name];
+    const get = (real, name) => name === "info" ? {vendor: "nvidia", architecture: "lovelace"} : own(real, name);
+    navigator.gpu.requestAdapter = async wish => new Proxy(await request(wish), {get});
+"""
+TIMED = """milliseconds => {
+    const {renderer} = nexwarp, render = renderer.render.bind(renderer);
+    renderer.render = async (...all) => ({...(await render(...all)), milliseconds});
+    Object.assign(nexwarp.pacing, {scale: 0.5, times: [], measured: 0});
+}"""
+
+
+def turn(tab: PageTab) -> None:
+    """Turn the scene for some thirty frames, and the page's measurement is over."""
+    tab.value("nexwarp.act('t')")
+    tab.wait("nexwarp.pacing.framesPerSecond !== null && !nexwarp.measuring")
+    tab.value("nexwarp.act('t')")
+
+
+def test_the_frame_rate_chooses_the_renderer_unless_a_person_does(open_tab):
+    tab = open_tab(webgpu=True, reduced_motion="no-preference")
+    tab.page.add_init_script(LARGE_GPU)
+    status = tab.page.locator("#status")
+    for milliseconds, expected in ((20, "neural, WebGPU"), (200, "baked, WebGL · since the neural texture had")):
+        tab.open()
+        assert "neural" in status.text_content()
+        pose = tab.value(POSE)
+        tab.value(TIMED, milliseconds)
+        turn(tab)
+        tab.wait(f"document.getElementById('status').textContent.includes('{expected}')")
+        tab.wait(FINISHED)
+        assert tab.picture().std() > 0.05 and tab.value(POSE) != pose
+    # A person's choice holds, also when the page is loaded again.
+    tab.page.click("#more")
+    tab.page.get_by_label("Renderer").select_option("neural")
+    tab.wait("document.getElementById('status').textContent.includes('neural, WebGPU')")
+    tab.wait(FINISHED)
+    tab.page.reload()
+    tab.wait(FINISHED)
+    assert "neural" in status.text_content() and tab.page.input_value("#renderer") == "webgpu"
+    assert not tab.value("nexwarp.measuring")
+    # Where it cannot be had, the page says so, and goes on.
+    tab.files = {name: data for name, data in tab.files.items() if name != BAKED_FILE}
+    tab.page.click("#more")
+    tab.page.get_by_label("Renderer").select_option("baked")
+    tab.wait(f"document.getElementById('announce').textContent.includes('{BAKED_FILE}')")
+    tab.value("nexwarp.pose = nexwarp.pose.turned(0.1, 0, false)")
+    tab.wait(FINISHED)
+    assert "neural" in status.text_content()
+    assert all("404" in error for error in tab.errors)
 
 
 @pytest.mark.parametrize("renderer", ["baked", "webgpu"])

@@ -19,11 +19,12 @@ export class BakedRenderer {
         if (!gl) {
             throw new SceneError("This browser has neither WebGPU nor WebGL2; current Chrome, Edge, Firefox and Safari have.");
         }
+        const renderer = new BakedRenderer(canvas, gl, onProgress, onStage);
         canvas.addEventListener("webglcontextlost", event => {
             event.preventDefault();
-            onLost(new SceneError("The graphics device was lost."));
+            if (!renderer.destroyed) onLost(new SceneError("The graphics device was lost."));
         });
-        return new BakedRenderer(canvas, gl, onProgress, onStage);
+        return renderer;
     }
 
     constructor(canvas, gl, onProgress, onStage) {
@@ -40,10 +41,11 @@ export class BakedRenderer {
         this.scene = new BakedScene(header, reader.arrays);
         this.header = header;
         this.onStage("header");
+        this.#upload();
+        this.onStage("geometry"); // the surfels' own colours can be drawn
         const image = await this.#atlasImage(header.atlas);
-        this.#upload(image);
+        this.#uploadAtlas(image);
         image.close();
-        this.onStage("geometry");
         this.onStage("done");
     }
 
@@ -59,11 +61,11 @@ export class BakedRenderer {
         return image;
     }
 
-    #upload(image) {
-        const {gl, scene} = this;
+    #upload() {
+        const {gl, scene} = this, {atlas} = scene.header;
         const largest = gl.getParameter(gl.MAX_TEXTURE_SIZE);
         const rows = Math.ceil(scene.count / SURFELS_PER_ROW);
-        const sides = [image.width, image.height, rows, SURFELS_PER_ROW * Math.max(scene.coefficients - 1, GEOMETRY_TEXELS)];
+        const sides = [atlas.width, atlas.height, rows, SURFELS_PER_ROW * Math.max(scene.coefficients - 1, GEOMETRY_TEXELS)];
         if (Math.max(...sides) > largest) {
             const needed = Math.max(...sides);
             throw new SceneError(`This device draws textures of at most ${largest} pixels a side; the scene needs ${needed}.`);
@@ -77,12 +79,8 @@ export class BakedRenderer {
         const bytes = new Uint8Array(4 * width * rows);
         bytes.set(scene.harmonics);
         this.harmonics = this.#texture(gl.RGBA8, width, rows, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
-        gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
-        gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
-        this.atlas = gl.createTexture();
-        gl.bindTexture(gl.TEXTURE_2D, this.atlas);
-        gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
-        this.#filter(gl.LINEAR);
+        const nothing = Uint8Array.of(128, 128, 128, 255); // is added, until the atlas has arrived
+        this.atlas = this.#texture(gl.RGBA8, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, nothing);
         this.ids = gl.createBuffer();
         this.vertices = gl.createVertexArray();
         gl.bindVertexArray(this.vertices);
@@ -92,6 +90,14 @@ export class BakedRenderer {
         gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
         gl.vertexAttribDivisor(0, 1);
         gl.bindVertexArray(null);
+    }
+
+    #uploadAtlas(image) {
+        const {gl} = this;
+        gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
+        gl.bindTexture(gl.TEXTURE_2D, this.atlas);
+        gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
+        this.#filter(gl.LINEAR);
         if (gl.getError() === gl.OUT_OF_MEMORY) throw new SceneError("This device has too little graphics memory for the scene.");
     }
 
@@ -249,6 +255,7 @@ export class BakedRenderer {
     }
 
     destroy() {
+        this.destroyed = true;
         this.gl.getExtension("WEBGL_lose_context")?.loseContext();
     }
 }

@@ -12,9 +12,9 @@ const ZOOMS = {"+": 0.5, "=": 0.5, "-": 2};
 
 // `viewer` has get pose, set pose, flying, act(name), pickTarget(x, y).
 export class Controls {
-    constructor(canvas, viewer) {
-        Object.assign(this, {canvas, viewer, pointers: new Map(), keys: new Set(), fast: false, lastTap: null});
-        const on = (name, act, options) => canvas.addEventListener(name, act.bind(this), options);
+    constructor(stage, viewer) {
+        Object.assign(this, {stage, viewer, pointers: new Map(), keys: new Set(), fast: false, lastTap: null});
+        const on = (name, act, options) => stage.addEventListener(name, act.bind(this), options);
         on("pointerdown", this.#down);
         on("pointermove", this.#move);
         for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) on(name, this.#up);
@@ -30,13 +30,13 @@ export class Controls {
     }
 
     get #scale() {
-        return RADIANS_PER_VIEW / Math.max(Math.min(this.canvas.clientWidth, this.canvas.clientHeight), 1);
+        return RADIANS_PER_VIEW / Math.max(Math.min(this.stage.clientWidth, this.stage.clientHeight), 1);
     }
 
     #down(event) {
-        this.canvas.focus({preventScroll: true});
-        this.canvas.setPointerCapture(event.pointerId);
-        this.canvas.classList.add("dragging");
+        this.viewer.canvas.focus({preventScroll: true});
+        this.stage.setPointerCapture(event.pointerId);
+        this.stage.classList.add("dragging");
         const moving = event.button === 2 || event.button === 1 || event.shiftKey;
         this.pointers.set(event.pointerId, {x: event.clientX, y: event.clientY, moving, travelled: 0, since: performance.now()});
     }
@@ -63,7 +63,7 @@ export class Controls {
 
     // The scene follows the fingers at the target's depth.
     #panned(pose, dx, dy) {
-        const pixel = 1 / pose.focal(Math.max(this.canvas.clientWidth, 1), Math.max(this.canvas.clientHeight, 1));
+        const pixel = 1 / pose.focal(Math.max(this.stage.clientWidth, 1), Math.max(this.stage.clientHeight, 1));
         return pose.moved(-dx * pixel, -dy * pixel, 0);
     }
 
@@ -77,7 +77,7 @@ export class Controls {
     #up(event) {
         const pointer = this.pointers.get(event.pointerId);
         if (!this.pointers.delete(event.pointerId)) return;
-        if (!this.pointers.size) this.canvas.classList.remove("dragging");
+        if (!this.pointers.size) this.stage.classList.remove("dragging");
         const now = performance.now(), tap = now - pointer.since < TAP_MILLISECONDS && pointer.travelled < TAP_PIXELS;
         if (event.type !== "pointerup" || !tap || pointer.moving) return;
         const last = this.lastTap;

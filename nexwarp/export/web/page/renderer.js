@@ -12,6 +12,7 @@ const MOST_ENTRIES = 2 ** 28;
 const SPARE = 1.5;
 const MOST_GROUPS = 65535;
 const SOFTWARE = /swiftshader|llvmpipe|basic render/i; // adapters that are no GPU
+const INTEGRATED = /\b(intel|qualcomm|arm|img-tec|samsung|broadcom)\b/i;
 
 // Bindings of the entry points: index to the buffer's name.
 const BINDINGS = {
@@ -44,6 +45,21 @@ function grouped(threads, size = 256) {
     return [Math.ceil(count / rows), rows];
 }
 
+// WebGPU, but on a phone, a GPU that shares the CPU's memory, or the CPU: the baked scene is faster there.
+export async function isWeak() {
+    const adapter = await navigator.gpu?.requestAdapter({ powerPreference: "high-performance" });
+    const phone = matchMedia("(pointer: coarse)").matches && Math.min(screen.width, screen.height) < 600;
+    return Boolean(adapter) && (phone || isSoftware(adapter.info) || INTEGRATED.test(nameOf(adapter.info)));
+}
+
+function nameOf({ vendor, architecture, description } = {}) {
+    return [vendor, architecture, description].filter(Boolean).join(" ");
+}
+
+function isSoftware(info) {
+    return info?.isFallbackAdapter === true || SOFTWARE.test(nameOf(info));
+}
+
 async function openDevice() {
     if (!("gpu" in navigator) || navigator.gpu === undefined) {
         throw new SceneError("This browser has no WebGPU. Recent versions of Chrome, Edge, Safari and Firefox have it.");
@@ -60,11 +76,9 @@ export class Renderer {
     // Opens a GPU. Throws SceneError, with a line for people, where there is none.
     static async create(canvas, { onProgress = () => {}, onStage = () => {}, onLost = () => {}, half = true } = {}) {
         const { adapter, device } = await openDevice();
-        const info = device.adapterInfo ?? adapter.info ?? {};
-        const adapterName = [info.vendor, info.architecture, info.description].filter(Boolean).join(" ") || "GPU";
-        const software = info.isFallbackAdapter === true || SOFTWARE.test(adapterName);
+        const software = isSoftware(device.adapterInfo ?? adapter.info);
         const renderer = new Renderer();
-        Object.assign(renderer, { device, canvas, onProgress, onStage, software, adapterName, modes: MODES });
+        Object.assign(renderer, { device, canvas, onProgress, onStage, software, modes: MODES });
         Object.assign(renderer, { buffers: {}, pipelines: {}, plans: new Map(), capacity: FIRST_ENTRIES, size: null });
         Object.assign(renderer, { chain: Promise.resolve(), destroyed: false });
         renderer.half = half && device.features.has("shader-f16");

@@ -4,10 +4,12 @@ import {BAKED_FILE, BakedRenderer} from "nexwarp/baked.js";
 import {FOV, Pose, basisOf} from "nexwarp/camera.js";
 import {Controls} from "nexwarp/controls.js";
 import {Pacing} from "nexwarp/pacing.js";
-import {Renderer} from "nexwarp/renderer.js";
+import {Renderer, isWeak} from "nexwarp/renderer.js";
 import {SceneError} from "nexwarp/scene.js";
 
-const SCENE_FILE = "scene.nxw";
+const RENDERERS = {webgpu: [Renderer, "scene.nxw"], baked: [BakedRenderer, BAKED_FILE]};
+const LEAST_RATE = 30; // frames a second; below, the baked scene takes over
+const CHOICE = "nexwarp renderer"; // under which the browser remembers it
 const MODES = {
     image: "image",
     plain: "without texture",
@@ -33,6 +35,7 @@ class Viewer {
     #pose = null;
 
     constructor() {
+        this.stage = element("stage");
         this.canvas = element("view");
         this.pacing = new Pacing();
         this.mode = "image";
@@ -65,48 +68,32 @@ class Viewer {
 
     async start() {
         try {
-            await this.#load(query.get("renderer"));
+            await this.#load();
         } catch (error) {
             this.#fail(error);
         }
     }
 
-    // The exact renderer where there is a GPU for WebGPU; else, or where it fails, the baked scene.
-    async #load(wanted) {
-        const events = {
-            onProgress: progress => this.#progress(progress),
-            onStage: stage => this.#stage(stage),
-            onLost: reason => this.#lost(reason),
-        };
-        let failure = null, software = false;
-        if (wanted !== "baked") {
+    // The renderer of the address, or a person's choice; else the exact one where a GPU carries it. Where the first fails,
+    // the other is tried.
+    async #load() {
+        const named = known(query.get("renderer")), chosen = named ?? remembered();
+        this.measuring = !chosen;
+        const weak = !chosen && (await isWeak());
+        if (weak) this.reason = "the default on this kind of device";
+        const order = named ? [named] : new Set([chosen ?? (weak ? "baked" : "webgpu"), "webgpu", "baked"]);
+        let failure = null;
+        for (const kind of order) {
             try {
-                const renderer = await Renderer.create(this.canvas, events);
-                this.renderer = renderer;
-                software = wanted !== "webgpu" && renderer.software; // the baked scene is faster there
-                if (software) throw new SceneError("WebGPU runs on the CPU here.");
-                await renderer.load(SCENE_FILE);
+                await this.use(kind);
+                failure = null;
+                break;
             } catch (error) {
-                if (wanted === "webgpu" || this.running) throw error;
-                failure = error;
+                if (this.running) throw error;
+                if (!failure || !error.missing) failure = error;
             }
         }
-        if (failure || wanted === "baked") {
-            this.renderer?.destroy();
-            this.renderer = null;
-            this.#freshCanvas();
-            try {
-                const renderer = await BakedRenderer.create(this.canvas, events);
-                this.renderer = renderer;
-                await renderer.load(BAKED_FILE);
-            } catch (error) {
-                if (!failure || !error.missing) throw error;
-                if (!software) throw failure;
-                this.#freshCanvas();
-                await this.#load("webgpu");
-                return;
-            }
-        }
+        if (failure) throw failure;
         this.#firstPicture();
         this.state = "ready";
         this.dirty = true;
@@ -114,11 +101,52 @@ class Viewer {
         this.#announce("The scene is loaded.");
     }
 
-    // A canvas that has given a WebGPU context gives no other.
-    #freshCanvas() {
-        const fresh = this.canvas.cloneNode(true);
-        this.canvas.replaceWith(fresh);
-        this.canvas = fresh;
+    // Draw with a renderer: at once if there is none yet, else when it has loaded. A canvas that has given a context of one
+    // kind gives no other, so each renderer has its own.
+    async use(kind) {
+        const [Kind, file] = RENDERERS[kind];
+        const canvas = this.canvas.cloneNode(true), before = this.running;
+        const renderer = await Kind.create(canvas, {
+            onProgress: progress => this.#progress(progress),
+            onStage: stage => this.#stage(stage),
+            onLost: reason => this.#lost(reason),
+        });
+        if (!before) this.#exchange(renderer, canvas);
+        try {
+            await renderer.load(file);
+        } catch (error) {
+            renderer.destroy();
+            throw error;
+        }
+        if (!before) return;
+        await this.drawing;
+        this.#exchange(renderer, canvas);
+        this.#offerModes();
+        this.#resize();
+    }
+
+    #exchange(renderer, canvas) {
+        this.renderer?.destroy();
+        this.canvas.replaceWith(canvas);
+        Object.assign(this, {renderer, canvas, sized: false, refined: null});
+    }
+
+    // A person's choice holds, here and on the next visit; none leaves it to the page.
+    async #choose(kind) {
+        remember(kind);
+        this.measuring = !kind;
+        this.reason = "";
+        if (kind) await this.use(kind).catch(error => this.#announce(error.message, true));
+    }
+
+    // Where the first second of frames is too slow, the baked scene takes over, if there is one.
+    #measure() {
+        const rate = this.pacing.framesPerSecond;
+        if (!this.measuring || rate === null) return;
+        this.measuring = false;
+        if (rate >= LEAST_RATE || this.renderer instanceof BakedRenderer) return;
+        this.reason = `since the neural texture had ${rate.toFixed(0)} frames a second`;
+        this.use("baked").catch(() => (this.reason = ""));
     }
 
     #stage(stage) {
@@ -156,10 +184,10 @@ class Viewer {
         this.index = header.start;
         this.#pose = this.start_;
         this.#readLink();
-        this.controls = new Controls(this.canvas, this);
+        this.controls = new Controls(this.stage, this);
         this.#settings(header);
         addEventListener("hashchange", () => this.#readLink());
-        new ResizeObserver(() => this.#resize()).observe(this.canvas);
+        new ResizeObserver(() => this.#resize()).observe(this.stage);
         this.#resize();
         this.#run();
     }
@@ -172,10 +200,11 @@ class Viewer {
     }
 
     #settings({exposures}) {
-        const mode = element("mode"), camera = element("camera");
-        mode.replaceChildren(...this.renderer.modes.map(name => new Option(MODES[name] ?? name, name)));
-        mode.value = this.mode;
+        const mode = element("mode"), camera = element("camera"), renderer = element("renderer");
+        this.#offerModes();
         mode.onchange = () => this.setMode(mode.value);
+        renderer.value = remembered() ?? "";
+        renderer.onchange = () => this.#choose(renderer.value);
         const options = this.cameras.map(({name}, i) => new Option(name, String(i)));
         camera.replaceChildren(...options);
         camera.onchange = () => this.goTo(Number(camera.value));
@@ -197,6 +226,13 @@ class Viewer {
         element("embed").onclick = () => this.#copyEmbed();
         if (query.has("turn") && !still()) this.#setTurning(true);
         element("full").hidden = !document.fullscreenEnabled;
+    }
+
+    #offerModes() {
+        const {modes} = this.renderer;
+        element("mode").replaceChildren(...modes.map(name => new Option(MODES[name], name)));
+        if (!modes.includes(this.mode)) this.mode = "image";
+        element("mode").value = this.mode;
     }
 
     // What a key or a button does; false for a key without meaning.
@@ -318,11 +354,8 @@ class Viewer {
         const mode = new URLSearchParams(text).get("mode") ?? "image";
         if (!pose) return;
         this.pose = pose;
-        const offered = this.renderer.modes.includes(mode) ? mode : "image";
-        if (offered !== this.mode) {
-            this.mode = offered;
-            if (element("mode").options.length) element("mode").value = offered;
-        }
+        this.mode = mode;
+        this.#offerModes();
     }
 
     #resize() {
@@ -350,13 +383,9 @@ class Viewer {
             this.dirty = false;
             const options = this.saving ? {resolutionScale: 1} : this.pacing.options;
             this.refined = options.resolutionScale === 1 || this.pacing.fixed !== null ? "full" : "coarse";
-            this.drawing = true;
-            try {
-                await this.#draw(options);
-                this.drawing = false;
-            } catch (error) {
-                this.#fail(error);
-            }
+            this.drawing = this.#draw(options).catch(error => this.#fail(error));
+            await this.drawing;
+            this.drawing = null;
         }
     }
 
@@ -370,6 +399,7 @@ class Viewer {
             performance.mark("first picture");
         }
         this.pacing.took(milliseconds, options);
+        this.#measure();
         this.#showStatus(options);
     }
 
@@ -396,9 +426,10 @@ class Viewer {
     #showStatus({resolutionScale}) {
         const {width, height} = this.canvas, {surfels} = this.renderer;
         const size = `${Math.round(width * resolutionScale)} × ${Math.round(height * resolutionScale)}`;
-        const kind = this.renderer instanceof BakedRenderer ? "baked, WebGL" : "exact, WebGPU";
+        const kind = this.renderer instanceof BakedRenderer ? ["baked, WebGL", this.reason] : ["neural, WebGPU"];
         const time = this.pacing.milliseconds.toFixed(0);
-        element("status").textContent = `${surfels.toLocaleString("en")} surfels · ${size} · ${time} ms · ${kind}`;
+        const facts = [`${surfels.toLocaleString("en")} surfels`, size, `${time} ms`, ...kind];
+        element("status").textContent = facts.filter(Boolean).join(" · ");
         const fov = Math.round(Math.min(Math.max(this.#pose.fov, FOV[0]), FOV[1]));
         if (document.activeElement !== element("fov")) element("fov").value = String(fov);
     }
@@ -422,6 +453,24 @@ class Viewer {
         message.hidden = false;
         const known = error instanceof SceneError;
         message.textContent = known ? error.message : `The scene cannot be shown: ${error?.message ?? error}`;
+    }
+}
+
+const known = kind => (Object.hasOwn(RENDERERS, kind) ? kind : null);
+
+function remembered() {
+    try {
+        return known(localStorage.getItem(CHOICE));
+    } catch {
+        return null; // the browser keeps nothing
+    }
+}
+
+function remember(kind) {
+    try {
+        localStorage.setItem(CHOICE, kind);
+    } catch {
+        // It holds until the page is left.
     }
 }
 
