@@ -28,6 +28,10 @@ WEBGPU = ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"]
 KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 DTYPES = {"u8": "<u1", "u16": "<u2", "u32": "<u4", "f16": "<f2", "f32": "<f4"}
 URL = "http://localhost/"  # a secure context
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+DRAWN = "nexwarp.state === 'ready' && nexwarp.frames > 0 && nexwarp.refined === 'full'"
+FINISHED = f"{DRAWN} && !nexwarp.dirty && !nexwarp.drawing && !nexwarp.flight && !nexwarp.pacing.moving"
+POSE = "[...nexwarp.pose.eye, nexwarp.pose.yaw, nexwarp.pose.pitch, nexwarp.pose.distance]"
 
 
 def web_model(count: int = 60, *, options: nw.RenderOptions | None = None, **shape: Any) -> tuple[nw.Model, nw.Camera]:
@@ -101,6 +105,34 @@ class Tab:
     def value(self, expression: str, *arguments: Any) -> Any:
         """What an expression is in the page."""
         return self.page.evaluate(expression, *arguments)
+
+
+class PageTab(Tab):
+    """A page of a scene."""
+
+    def wait(self, condition: str, seconds: float = 60.0) -> None:
+        """Wait for a condition; the page's policy forbids what playwright's own wait needs."""
+        for _ in range(int(seconds / 0.05)):
+            if self.value(condition):
+                return
+            self.page.wait_for_timeout(50)
+        state = self.value("globalThis.nexwarp ? nexwarp.state : 'no page'")
+        raise AssertionError(f"{condition}: not within {seconds} s; {state}: {self.message} {self.errors}")
+
+    def open(self, query: str = "") -> None:
+        self.page.goto(URL + query)
+        self.wait(FINISHED)
+
+    @property
+    def message(self) -> str:
+        return str(self.page.inner_text("#message"))
+
+    def picture(self) -> np.ndarray:
+        """The last frame (H, W, 3) in [0, 1]."""
+        values = self.value(
+            "nexwarp.renderer.read('image').then(x => [[nexwarp.canvas.height, nexwarp.canvas.width], Array.from(x)])"
+        )
+        return np.array(values[1], np.float32).reshape(*values[0], 4)[..., :3]
 
 
 def ring(count: int = 4, width: int = 64, height: int = 48) -> dict[str, nw.Camera]:

@@ -1,11 +1,9 @@
 """The web page in a browser: loading, controls, links, touch, damaged files, and the baked scene against Python."""
 
-import functools
 import html
 import json
 import re
 import struct
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,17 +14,12 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from nexwarp.export.bake import bake
 from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE
-from nexwarp.export.web.export import page_files, static_files
+from nexwarp.export.web.export import static_files
 from nexwarp.export.web.scene_file import SCENE_FILE
 from tests.export.web import support
-from tests.export.web.support import CHROMIUM, URL, WEBGPU, Tab, psnr
-from tests.scenes import make_surfels, make_texture, random_scene
+from tests.export.web.support import CHROMIUM, FINISHED, POSE, URL, PageTab, psnr
 
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-DRAWN = "nexwarp.state === 'ready' && nexwarp.frames > 0 && nexwarp.refined === 'full'"
-FINISHED = f"{DRAWN} && !nexwarp.dirty && !nexwarp.drawing && !nexwarp.flight && !nexwarp.pacing.moving"
 DRAW = """async camera => {
     const renderer = nexwarp.renderer;
     nexwarp.state = "failed"; // stops the page's own frames
@@ -35,85 +28,12 @@ DRAW = """async camera => {
     return [Array.from(await renderer.read("image")), await renderer.pick(32.5, 24.5)];
 }"""
 TARGET = "(p => p.eye.map((x, i) => x + p.distance * p.axes().forward[i]))(nexwarp.pose)"
-POSE = "[...nexwarp.pose.eye, nexwarp.pose.yaw, nexwarp.pose.pitch, nexwarp.pose.distance]"
 
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"),
     pytest.mark.usefixtures("one_torch_thread"),
     pytest.mark.timeout(300),
 ]
-
-
-@pytest.fixture(scope="module")
-def cameras() -> dict[str, nw.Camera]:
-    return support.ring()
-
-
-@pytest.fixture(scope="module")
-def model(cameras) -> nw.Model:
-    """A small model with everything that a page has to show: exposures, vignetting, detail limits."""
-    surfels = make_surfels(random_scene(40, width=64, height=48, seed=3))
-    gains = torch.linspace(-0.3, 0.3, len(cameras))[:, None].expand(-1, 3) * torch.tensor([1.0, 0.5, -0.5])
-    exposures = nw.Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
-    limits = nw.DetailLimits(torch.full((40,), 0.01), torch.full((40,), 0.04))
-    texture = make_texture(residual=True)
-    with torch.no_grad():
-        texture.grid.mul_(0.3)
-    return nw.Model(surfels, texture, exposures, limits, nw.RenderOptions(background=(0.1, 0.2, 0.3)))
-
-
-@pytest.fixture(scope="module")
-def site(model, cameras) -> dict[str, bytes]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("nexwarp.export.web.export.bake", functools.partial(bake, steps=10))
-        return page_files(model, cameras, title="Two & <three>")
-
-
-class PageTab(Tab):
-    """A page of a scene."""
-
-    def wait(self, condition: str, seconds: float = 60.0) -> None:
-        """Wait for a condition; the page's policy forbids what playwright's own wait needs."""
-        for _ in range(int(seconds / 0.05)):
-            if self.value(condition):
-                return
-            self.page.wait_for_timeout(50)
-        state = self.value("globalThis.nexwarp ? nexwarp.state : 'no page'")
-        raise AssertionError(f"{condition}: not within {seconds} s; {state}: {self.message} {self.errors}")
-
-    def open(self, query: str = "") -> None:
-        self.page.goto(URL + query)
-        self.wait(FINISHED)
-
-    @property
-    def message(self) -> str:
-        return str(self.page.inner_text("#message"))
-
-    def picture(self) -> np.ndarray:
-        """The last frame (H, W, 3) in [0, 1]."""
-        values = self.value(
-            "nexwarp.renderer.read('image').then(x => [[nexwarp.canvas.height, nexwarp.canvas.width], Array.from(x)])"
-        )
-        return np.array(values[1], np.float32).reshape(*values[0], 4)[..., :3]
-
-
-@pytest.fixture
-def open_tab(site) -> Iterator[Callable[..., PageTab]]:
-    """What opens a tab of a browser that has WebGPU or not; of a size, or with further options of a context."""
-    api = pytest.importorskip("playwright.sync_api")
-    with api.sync_playwright() as playwright:
-
-        def opened(width: int = 200, height: int = 150, *, webgpu: bool = False, **options: Any) -> PageTab:
-            flags = [*FLAGS, *(WEBGPU if webgpu else ())]
-            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
-            return PageTab(browser, site, viewport={"width": width, "height": height}, **options)
-
-        yield opened
-
-
-@pytest.fixture
-def tab(open_tab) -> PageTab:
-    return open_tab()
 
 
 def test_the_baked_scene_in_the_page_is_the_one_of_python(tab, site, model, cameras, tmp_path):

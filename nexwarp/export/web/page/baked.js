@@ -159,17 +159,33 @@ export class BakedRenderer {
         const height = Math.max(Math.round(canvas.height * resolutionScale), 1);
         this.#resizeTarget(width, height);
         this.last = {camera: resized(camera, width, height), mode, exposure};
+        this.#sort(camera.viewmat);
         this.#drawQuads();
-        this.#drawResolved(null, canvas.width, canvas.height);
+        this.#drawResolved(null, canvas);
         await finished(gl);
         return {milliseconds: performance.now() - start, entries: scene.count};
     }
 
+    // Draw cameras into parts (x, y, width, height) of a framebuffer, with one order of the surfels: the eyes of a head.
+    // What lies behind the surfels is the background, or nothing.
+    renderEyes(eyes, headViewmat, frame, seeThrough) {
+        this.#sort(headViewmat);
+        for (const {camera, part} of eyes) {
+            this.#resizeTarget(part.width, part.height);
+            this.last = {camera, mode: "image", exposure: "mean", seeThrough};
+            this.#drawQuads();
+            this.#drawResolved(frame, part);
+        }
+    }
+
+    #sort(viewmat) {
+        const {gl} = this;
+        gl.bindBuffer(gl.ARRAY_BUFFER, this.ids);
+        gl.bufferSubData(gl.ARRAY_BUFFER, 0, this.scene.sorted(viewmat));
+    }
+
     #drawQuads() {
         const {gl, scene, target, last: {camera, mode}} = this;
-        const order = scene.sorted(camera.viewmat);
-        gl.bindBuffer(gl.ARRAY_BUFFER, this.ids);
-        gl.bufferSubData(gl.ARRAY_BUFFER, 0, order);
         gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
         gl.viewport(0, 0, target.width, target.height);
         gl.disable(gl.DEPTH_TEST);
@@ -201,10 +217,10 @@ export class BakedRenderer {
         gl.bindVertexArray(null);
     }
 
-    #drawResolved(frame, width, height) {
-        const {gl, scene, target, last: {camera, mode, exposure}} = this;
+    #drawResolved(frame, {x = 0, y = 0, width, height}) {
+        const {gl, scene, target, last: {camera, mode, exposure, seeThrough = false}} = this;
         gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-        gl.viewport(0, 0, width, height);
+        gl.viewport(x, y, width, height);
         gl.disable(gl.BLEND);
         const {program, uniforms} = this.resolve;
         gl.useProgram(program);
@@ -218,7 +234,8 @@ export class BakedRenderer {
         gl.uniform3fv(uniforms.falloff, lens ? lens.falloff : [0, 0, 1]);
         gl.uniform4fv(uniforms.intrinsics, camera.K);
         gl.uniform2f(uniforms.size, target.width, target.height);
-        gl.uniform2f(uniforms.outputSize, width, height);
+        gl.uniform4f(uniforms.part, x, y, width, height);
+        gl.uniform1f(uniforms.cover, seeThrough ? 0 : 1);
         gl.uniform2fv(uniforms.span, depthSpan(scene.header, camera.viewmat));
         gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
@@ -231,7 +248,7 @@ export class BakedRenderer {
         const frame = gl.createFramebuffer();
         gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
         gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
-        this.#drawResolved(frame, width, height);
+        this.#drawResolved(frame, {width, height});
         const bytes = new Uint8Array(4 * width * height);
         gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
         gl.deleteFramebuffer(frame);

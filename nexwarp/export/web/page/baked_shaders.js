@@ -151,8 +151,9 @@ void main() {
 export const RESOLVE_FRAGMENT = `${COMMON}
 uniform sampler2D frame;
 uniform vec3 background, gains, falloff;
-uniform vec4 intrinsics;
-uniform vec2 size, outputSize, span;
+uniform vec4 intrinsics, part; // part of the output: left, bottom, width, height
+uniform vec2 size, span;
+uniform float cover; // opacity of the background
 uniform int mode;
 out vec4 result;
 
@@ -165,11 +166,11 @@ vec3 viridis(float t) {
 }
 
 void main() {
-  vec2 place = gl_FragCoord.xy / outputSize;
+  vec2 place = (gl_FragCoord.xy - part.xy) / part.zw;
   vec4 x = texture(frame, place);
   vec3 color = x.rgb;
   if (mode <= 1) {
-    color += (1.0 - x.a) * background;
+    color += cover * (1.0 - x.a) * background;
     vec2 pixel = vec2(place.x, 1.0 - place.y) * size;
     vec2 ray = (pixel - intrinsics.zw) / intrinsics.xy;
     float t = min(dot(ray, ray) / falloff.z, 1.0);
@@ -181,6 +182,6 @@ void main() {
   } else if (mode == 5) {
     color = vec3(x.a);
   }
-  result = vec4(color, 1.0);
+  result = vec4(color, max(x.a, cover));
 }
 `;

@@ -93,7 +93,7 @@ function checkExposures(exposures) {
     }
 }
 
-function checkCameras({ cameras, start, center, radius, up, near, bounds }) {
+function checkCameras({ cameras, start, center, radius, metres, up, near, bounds }) {
     expect(Array.isArray(cameras) && cameras.length <= 1000, "cameras: expected a list of at most 1000");
     for (const camera of cameras) {
         const good =
@@ -113,7 +113,9 @@ function checkCameras({ cameras, start, center, radius, up, near, bounds }) {
     expect(areNumbers([near], 1, 0, 1e16), "near: expected a number");
     const points = Array.isArray(bounds) && bounds.length === 2 && bounds.every((point) => areNumbers(point, 3));
     expect(points, "bounds: expected two points");
-    expect(radius === null || (areNumbers([radius], 1) && radius > 0), "radius: expected a number above 0");
+    for (const [name, x] of Object.entries({ radius, metres })) {
+        expect(x === null || (areNumbers([x], 1) && x > 0), `${name}: expected a number above 0`);
+    }
 }
 
 function checkBaked({ atlas, sh_coefficients: coefficients, sh_ranges: ranges }) {
@@ -275,7 +277,7 @@ export class SceneReader {
         } catch (error) {
             throw error instanceof SceneError ? error : new SceneError("scene file: expected a JSON header");
         }
-        header = isObject(header) ? { texture: null, exposures: null, radius: null, ...header } : header;
+        header = isObject(header) ? { texture: null, exposures: null, radius: null, metres: null, ...header } : header;
         checkHeader(header);
         this.kind.check(header);
         this.base = 16 + length;

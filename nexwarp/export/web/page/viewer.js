@@ -6,6 +6,7 @@ import {Controls} from "nexwarp/controls.js";
 import {Pacing} from "nexwarp/pacing.js";
 import {Renderer, isWeak} from "nexwarp/renderer.js";
 import {SceneError} from "nexwarp/scene.js";
+import {offerSessions} from "nexwarp/xr.js";
 
 const RENDERERS = {webgpu: [Renderer, "scene.nxw"], baked: [BakedRenderer, BAKED_FILE]};
 const LEAST_RATE = 30; // frames a second; below, the baked scene takes over
@@ -25,7 +26,7 @@ const LINK_MILLISECONDS = 400; // after the last change, before the address foll
 const NOTE_MILLISECONDS = 3000; // that a note is shown
 const LARGEST_RATIO = 2; // canvas pixels to CSS pixels
 const TURN = 0.2; // radians a second, of a page that turns by itself: `?turn` in the address
-const EMBED = 'width="960" height="540" style="border:0" allow="fullscreen; clipboard-write" loading="lazy"';
+const EMBED = 'width="960" height="540" style="border:0" allow="fullscreen; clipboard-write; xr-spatial-tracking" loading="lazy"';
 
 const element = id => document.getElementById(id);
 const query = new URLSearchParams(location.search);
@@ -44,6 +45,7 @@ class Viewer {
         this.saving = false; // of a picture
         this.exposure = "photos";
         this.flight = null;
+        this.session = null; // of WebXR: the page's own frames rest
         this.frames = 0;
         this.index = 0;
         this.state = "loading"; // "loading", "preview", "ready" or "failed": for tests
@@ -136,7 +138,7 @@ class Viewer {
         remember(kind);
         this.measuring = !kind;
         this.reason = "";
-        if (kind) await this.use(kind).catch(error => this.#announce(error.message, true));
+        if (kind) await this.use(kind).catch(error => this.note(error.message));
     }
 
     // Where the first second of frames is too slow, the baked scene takes over, if there is one.
@@ -226,6 +228,7 @@ class Viewer {
         element("embed").onclick = () => this.#copyEmbed();
         if (query.has("turn") && !still()) this.#setTurning(true);
         element("full").hidden = !document.fullscreenEnabled;
+        offerSessions(this);
     }
 
     #offerModes() {
@@ -323,9 +326,9 @@ class Viewer {
     async #copy(text, done, failed) {
         try {
             await navigator.clipboard.writeText(text);
-            this.#announce(done, true);
+            this.note(done);
         } catch {
-            this.#announce(failed, true);
+            this.note(failed);
         }
     }
 
@@ -378,6 +381,7 @@ class Viewer {
             this.controls.advance(seconds);
             this.#advanceFlight();
             this.#advanceTurn(seconds);
+            if (this.session) continue;
             const refine = this.refined !== "full" && !this.pacing.moving;
             if (!this.dirty && !refine) continue;
             this.dirty = false;
@@ -411,7 +415,7 @@ class Viewer {
         const address = URL.createObjectURL(await page.convertToBlob());
         Object.assign(document.createElement("a"), {href: address, download: "nexwarp.png"}).click();
         URL.revokeObjectURL(address);
-        this.#announce("The picture is saved.", true);
+        this.note("The picture is saved.");
     }
 
     #advanceFlight() {
@@ -432,6 +436,17 @@ class Viewer {
         element("status").textContent = facts.filter(Boolean).join(" · ");
         const fov = Math.round(Math.min(Math.max(this.#pose.fov, FOV[0]), FOV[1]));
         if (document.activeElement !== element("fov")) element("fov").value = String(fov);
+    }
+
+    // A line that everybody sees for some seconds.
+    note(text) {
+        this.#announce(text, true);
+    }
+
+    // The session of WebXR is over.
+    leave() {
+        this.session = null;
+        this.#changed();
     }
 
     #announce(text, visible = false) {

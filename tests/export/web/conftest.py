@@ -1,0 +1,59 @@
+"""A page of a small model, and tabs of a browser that show it."""
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+
+import nexwarp as nw
+from nexwarp.export.bake import bake
+from nexwarp.export.web.export import page_files
+from tests.export.web import support
+from tests.export.web.support import CHROMIUM, FLAGS, WEBGPU, PageTab
+from tests.scenes import make_surfels, make_texture, random_scene
+
+
+@pytest.fixture(scope="module")
+def cameras() -> dict[str, nw.Camera]:
+    return support.ring()
+
+
+@pytest.fixture(scope="module")
+def model(cameras) -> nw.Model:
+    """A small model with everything that a page has to show: exposures, vignetting, detail limits."""
+    surfels = make_surfels(random_scene(40, width=64, height=48, seed=3))
+    gains = torch.linspace(-0.3, 0.3, len(cameras))[:, None].expand(-1, 3) * torch.tensor([1.0, 0.5, -0.5])
+    exposures = nw.Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
+    limits = nw.DetailLimits(torch.full((40,), 0.01), torch.full((40,), 0.04))
+    texture = make_texture(residual=True)
+    with torch.no_grad():
+        texture.grid.mul_(0.3)
+    return nw.Model(surfels, texture, exposures, limits, nw.RenderOptions(background=(0.1, 0.2, 0.3)))
+
+
+@pytest.fixture(scope="module")
+def site(model, cameras) -> dict[str, bytes]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("nexwarp.export.web.export.bake", functools.partial(bake, steps=10))
+        return page_files(model, cameras, title="Two & <three>")
+
+
+@pytest.fixture
+def open_tab(site) -> Iterator[Callable[..., PageTab]]:
+    """What opens a tab of a browser that has WebGPU or not; of a size, or with further options of a context."""
+    api = pytest.importorskip("playwright.sync_api")
+    with api.sync_playwright() as playwright:
+
+        def opened(width: int = 200, height: int = 150, *, webgpu: bool = False, **options: Any) -> PageTab:
+            flags = [*FLAGS, *(WEBGPU if webgpu else ())]
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+            return PageTab(browser, site, viewport={"width": width, "height": height}, **options)
+
+        yield opened
+
+
+@pytest.fixture
+def tab(open_tab) -> PageTab:
+    return open_tab()
