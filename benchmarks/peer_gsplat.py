@@ -9,6 +9,7 @@ has and the examples lack.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,9 +128,18 @@ class Gaussians:
 
 
 def train(
-    scene: Scene, count: int, iterations: int, seed: int, device: torch.device, settings: PeerSettings | None = None
+    scene: Scene,
+    count: int,
+    iterations: int,
+    seed: int,
+    device: torch.device,
+    settings: PeerSettings | None = None,
+    observe: Callable[[Gaussians], None] | None = None,
 ) -> Gaussians:
-    """Train `count` Gaussians at most; `settings` None are those of gsplat's MCMC example."""
+    """Train `count` Gaussians at most; `settings` None are those of gsplat's MCMC example.
+
+    `observe` is called after each step.
+    """
     settings = settings or PeerSettings()
     torch.manual_seed(seed)
     np.random.seed(seed)  # noqa: NPY002
@@ -174,6 +184,8 @@ def train(
             optimizer.zero_grad(set_to_none=True)
         control.after(step, info)
         optimizers["means"].param_groups[0]["lr"] *= decay
+        if observe is not None:
+            observe(gaussians)
     return gaussians
 
 

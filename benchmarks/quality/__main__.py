@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from benchmarks import quality
+from benchmarks.quality.curve import draw
 from benchmarks.quality.documents import MISSING, blocks, fill
 from benchmarks.quality.jobs import FOLDS, ITERATIONS, ROWS, SCENES, SIZE, TABLES, Row, TrainingJob, table_jobs
 from benchmarks.quality.results import read_results
@@ -20,7 +21,8 @@ def train(options: argparse.Namespace) -> int:
     """Run the trainings that the results file lacks."""
     rows = ROWS | own_rows(options.row or ())
     jobs = missing_jobs(wanted_jobs(options, rows), options.out)
-    failed = run_jobs(jobs, rows, options.data, options.out, options.jobs, options.pictures, options.models)
+    folders = {"pictures": options.pictures, "models": options.models}
+    failed = run_jobs(jobs, rows, options.data, options.out, options.jobs, **folders, curve=options.curve)
     return 1 if failed else 0
 
 
@@ -60,6 +62,12 @@ def table(options: argparse.Namespace) -> int:
     return 0
 
 
+def curves(options: argparse.Namespace) -> int:
+    """Draw quality over seconds."""
+    draw(read_results(options.results).values(), options.out)
+    return 0
+
+
 def publish(options: argparse.Namespace) -> int:
     """Fill the marked blocks of pages."""
     tables = blocks(read_results(options.results))
@@ -78,6 +86,10 @@ def make_parser() -> argparse.ArgumentParser:
     tables = commands.add_parser("table", help="print means over seeds as Markdown")
     tables.set_defaults(run=table)
     tables.add_argument("results", type=Path, nargs="+")
+    pictures = commands.add_parser("curves", help="draw the quality over seconds of trainings with --curve")
+    pictures.set_defaults(run=curves)
+    pictures.add_argument("results", type=Path, nargs="+")
+    pictures.add_argument("--out", type=Path, default=Path("curves.png"), help="default: %(default)s")
     pages = commands.add_parser("publish", help="fill the tables of the documents")
     pages.set_defaults(run=publish)
     pages.add_argument("results", type=Path, nargs="+")
@@ -100,6 +112,7 @@ def _add_train(parser: argparse.ArgumentParser) -> None:
     add("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the scenes")
     add("--out", type=Path, default=Path("quality.jsonl"), help="default: %(default)s")
     add("--jobs", type=int, default=1, help="trainings at once (default: %(default)s)")
+    add("--curve", action="store_true", help="also measure the quality at times of the training")
     add("--pictures", type=Path, help="folder for photo, rendering and error of each test view")
     add("--models", type=Path, help="folder to keep the models in")
 

@@ -6,25 +6,25 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from benchmarks import peer_gsplat
+from benchmarks.quality.curve import Curve, RenderImage, WatchedStages
 from benchmarks.quality.jobs import Row, TrainingJob, config_of, scene_of
 from benchmarks.quality.results import drop_unfinished, read_results, result_line
 from benchmarks.timing import git_commit
-from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.run.evaluate import METRICS, psnr
 from nexwarp.train.stages import StageRunner, StageStore
-
-RenderImage = Callable[[Camera], torch.Tensor]  # (H, W, 3), not clamped, on any device
 
 
 def missing_jobs(wanted: Sequence[TrainingJob], out: Path) -> list[TrainingJob]:
@@ -46,21 +46,25 @@ def run_jobs(
     workers: int = 1,
     pictures: Path | None = None,
     models: Path | None = None,
+    *,
+    curve: bool = False,
 ) -> int:
     """Append the result of each job to a results file; return how many failed.
 
     Args:
         jobs: what to train.
         rows: by name, at least those of the jobs.
-        data: as of `run_job`, as are `pictures` and `models`.
+        data: as of `run_job`, as are `pictures`, `models` and `curve`.
         out: the results file.
         workers: trainings at once.
         pictures: see `data`.
         models: see `data`.
+        curve: see `data`.
     """
     failed = 0
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        futures = {pool.submit(run_job, job, data, rows[job.row], pictures, models): job for job in jobs}
+        do = partial(run_job, data=data, pictures=pictures, models=models, curve=curve)
+        futures = {pool.submit(do, job, row=rows[job.row]): job for job in jobs}
         for future in as_completed(futures):
             job = futures[future]
             try:
@@ -76,7 +80,13 @@ def run_jobs(
 
 
 def run_job(
-    job: TrainingJob, data: Path, row: Row, pictures: Path | None = None, models: Path | None = None
+    job: TrainingJob,
+    data: Path,
+    row: Row,
+    *,
+    pictures: Path | None = None,
+    models: Path | None = None,
+    curve: bool = False,
 ) -> dict[str, Any]:
     """Train, render the test views and compare them with their photos.
 
@@ -86,6 +96,7 @@ def run_job(
         row: the job's.
         pictures: folder for photo, rendering and error of each test view.
         models: folder to keep the model in.
+        curve: add `curve`, metrics at times of the training; see `Curve`.
 
     Returns:
         A line of the results: the job and its row's settings; means of the metrics over the test views (None where one
@@ -94,15 +105,20 @@ def run_job(
         device, date, commit.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    loading = time.perf_counter()
     scene = scene_of(job, data)
+    watch = Curve(scene, loading) if curve else None
     if device.type == "cuda":
         gc.collect()  # arrays of the training before it in this process
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     begin = time.perf_counter()
     train = _train_gsplat if row.preset is None else _train_nexwarp
-    image, facts = train(job, row, scene, device, models)
+    image, facts = train(job, row, scene, device, models, watch)
     seconds = facts.pop("end") - begin
+    if watch is not None:
+        watch.look(lambda: image, last=True)
+        facts["curve"] = watch.points
     views = _compare(job, scene, image, pictures)
     camera = scene.test[0].camera
     known = {name: [x for v in views.values() if (x := v[name]) is not None] for name in METRICS}
@@ -130,12 +146,12 @@ def file_name(job: TrainingJob) -> str:
 
 
 def _train_nexwarp(
-    job: TrainingJob, row: Row, scene: Scene, device: torch.device, models: Path | None
+    job: TrainingJob, row: Row, scene: Scene, device: torch.device, models: Path | None, watch: Curve | None
 ) -> tuple[RenderImage, dict[str, Any]]:
-    runner = StageRunner(scene, config_of(job, row), device, StageStore())
-    runner.train_teachers()
+    store = StageStore() if watch is None else WatchedStages(watch)
+    runner = StageRunner(scene, config_of(job, row), device, store)
+    runner.train()
     trainer = runner.trainer
-    trainer.run()
     model = trainer.finish()
     end = time.perf_counter()
     with tempfile.TemporaryDirectory() as temporary:
@@ -150,15 +166,18 @@ def _train_nexwarp(
 
 
 def _train_gsplat(
-    job: TrainingJob, row: Row, scene: Scene, device: torch.device, _: Path | None
+    job: TrainingJob, row: Row, scene: Scene, device: torch.device, _: Path | None, watch: Curve | None
 ) -> tuple[RenderImage, dict[str, Any]]:
-    from benchmarks import peer_gsplat
-
     settings = peer_gsplat.PeerSettings(**row.settings)
-    gaussians = peer_gsplat.train(scene, job.size, job.iterations, job.seed, device, settings)
+    look = None if watch is None else lambda gaussians: watch.look(lambda: _gsplat_image(gaussians, device))
+    gaussians = peer_gsplat.train(scene, job.size, job.iterations, job.seed, device, settings, look)
     torch.cuda.synchronize()
     facts = {"primitives": len(gaussians.splats["means"]), "megabytes": gaussians.megabytes, "end": time.perf_counter()}
-    return lambda camera: gaussians.image(camera.to(device)), facts
+    return _gsplat_image(gaussians, device), facts
+
+
+def _gsplat_image(gaussians: peer_gsplat.Gaussians, device: torch.device) -> RenderImage:
+    return lambda camera: gaussians.image(camera.to(device))
 
 
 @torch.no_grad()
