@@ -155,23 +155,41 @@ def _times(ways: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def suited_path(cameras: Sequence[Camera]) -> str:
-    """Return "ellipse" for cameras that look at a common subject from all around it, otherwise "interpolate".
+    """Return "ellipse" for cameras that look at a common subject from all around it, otherwise "interpolate"."""
+    return "ellipse" if _surround(cameras, 1.0) else "interpolate"
 
-    The focus must be in nine of ten images, and no angle about it of more than 120 degrees without a camera.
+
+def subject(cameras: Sequence[Camera]) -> tuple[torch.Tensor, float] | None:
+    """Return a ball around what cameras all around have in the middle of their images; None for other cameras.
+
+    Its centre (3,) float64 is their focus, its radius half the longer side of what an image shows there (the median).
+    """
+    if not _surround(cameras, 0.5):
+        return None
+    target, _ = focus_ahead(cameras)
+    depths = [camera.viewmat[2].double().cpu() @ torch.cat([target, target.new_ones(1)]) for camera in cameras]
+    sides = [max(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras]
+    return target, float(np.median([depth * side / 2 for depth, side in zip(depths, sides, strict=True)]))
+
+
+def _surround(cameras: Sequence[Camera], middle: float) -> bool:
+    """Whether nine of ten images have the focus in their middle, a share of either side.
+
+    And no angle about it of more than 120 degrees is without a camera.
     """
     target, share = focus_ahead(cameras)
     if share < COMMON:
-        return "interpolate"
+        return False
     viewmats, centres = camera_poses(cameras)
     seen = torch.stack([each.K.detach().double().cpu() for each in cameras]) @ (
         viewmats[:, :3, :3] @ target + viewmats[:, :3, 3]
     ).unsqueeze(2)
     places = seen[:, :2, 0] / seen[:, 2:, 0] / torch.tensor([[each.width, each.height] for each in cameras])
-    inside = ((seen[:, 2, 0] > 0.0) & ((places - 0.5).abs() < 0.5).all(dim=1)).double().mean()
+    inside = ((seen[:, 2, 0] > 0.0) & ((places - 0.5).abs() < middle / 2).all(dim=1)).double().mean()
     level = torch.linalg.svd(up_direction(cameras)[None])[2][1:]
     angles = torch.atan2(*((centres - target) @ level.T).unbind(1)).sort().values
     gaps = torch.cat([angles, angles[:1] + 2.0 * math.pi]).diff()
-    return "ellipse" if inside >= COMMON and gaps.max() <= WIDEST_GAP else "interpolate"
+    return bool(inside >= COMMON and gaps.max() <= WIDEST_GAP)
 
 
 def between(cameras: Sequence[Camera], generator: torch.Generator) -> list[Camera]:

@@ -11,7 +11,7 @@ from tyro.conf import arg
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
-from nexwarp.cameras.paths import focus_ahead
+from nexwarp.cameras.paths import focus_ahead, subject
 from nexwarp.cameras.similarity import Similarity, upright
 from nexwarp.errors import RunError, SettingError
 from nexwarp.export.bake import Progress
@@ -20,6 +20,7 @@ from nexwarp.model.edit import REMOVE, Edit, checksum, moved_surfels, write_edit
 from nexwarp.model.floaters import find_floaters
 from nexwarp.run.folder import TRAIN, OpenedModel
 
+SUBJECT = ("subject",)
 MIDDLE = (0.05, 0.95)  # of the surfels' coordinates
 LEVEL = 0.9  # least height of the normal of a surfel that may be ground
 REACH = 1.5  # of the surfels that may be ground, in distances of the farthest camera from the middle of all
@@ -31,9 +32,9 @@ class EditOrder:
     """The operation of `nexwarp edit`, one at a time. Positions and lengths are in the coordinates of exports."""
 
     crop: Annotated[
-        tuple[str, ...] | None, arg(metavar="{box X0 Y0 Z0 X1 Y1 Z1,sphere X Y Z R}", help_behavior_hint="")
+        tuple[str, ...] | None, arg(metavar="{subject,box X0 Y0 Z0 X1 Y1 Z1,sphere X Y Z R}", help_behavior_hint="")
     ] = None
-    """Keep the surfels whose centres lie in a box along the axes, or in a sphere."""
+    """Keep the surfels whose centres lie in a box along the axes, in a sphere, or around what all photos look at."""
     remove_floaters: Annotated[bool, arg(help_behavior_hint="")] = False
     """Remove surfels in empty space that few training views agree on."""
     level: Annotated[bool, arg(help_behavior_hint="")] = False
@@ -63,9 +64,9 @@ class EditOrder:
 
     def _given(self) -> Edit | None:
         """Return the edit that the options give alone, whatever the scene; ValueError where its numbers do not fit."""
-        if self.crop is not None:
+        if self.crop is not None and self.crop != SUBJECT:
             if self.crop[:1] not in [(name,) for name in REGIONS]:
-                raise ValueError(f"expected box or sphere, and numbers, got {' '.join(self.crop)!r:.60}")
+                raise ValueError(f"expected subject, box or sphere, and numbers, got {' '.join(self.crop)!r:.60}")
             return Edit(self.crop[0], tuple(map(float, self.crop[1:])))
         if self.scale_between is not None:
             *ends, length = self.scale_between
@@ -84,6 +85,10 @@ class EditOrder:
         if self.level:
             motion = _levelling(opened)
             return Edit("level", (*motion.rotation.ravel().tolist(), *motion.shift.tolist()))
+        if self.crop == SUBJECT:
+            if (crop := subject_crop(opened)) is None:
+                raise RunError(f"{opened.path}: --crop subject: expected photos from all around, found others")
+            return crop
         return self._given()
 
 
@@ -135,10 +140,24 @@ def crop_command(opened: OpenedModel, centre: np.ndarray, radius: float) -> str:
     return f"nexwarp edit {opened.path} --crop sphere {' '.join(f'{x:.4g}' for x in numbers)}"
 
 
-def added(opened: OpenedModel, edit: Edit) -> OpenedModel:
-    """Write one more edit of a run, and return the run with it; RunError, and no file changes, if nothing is left."""
+def subject_crop(opened: OpenedModel) -> Edit | None:
+    """Return the crop to what the training cameras look at from all around, None where they do not."""
+    ball = subject(_training_cameras(opened))
+    if ball is None:
+        return None
+    return Edit("sphere", (*opened.frame.points(ball[0].numpy()).tolist(), ball[1] * opened.frame.scale))
+
+
+def edited(opened: OpenedModel, edit: Edit) -> OpenedModel:
+    """Return a run with one more edit, which is not written; RunError if nothing is left."""
     changed = dataclasses.replace(opened)
     vars(changed).update(trained=opened.trained, edits=[*opened.edits, edit])
     _ = changed.kept  # which checks them
+    return changed
+
+
+def added(opened: OpenedModel, edit: Edit) -> OpenedModel:
+    """Write one more edit of a run, and return the run with it; RunError, and no file changes, if nothing is left."""
+    changed = edited(opened, edit)
     write_edits(opened.folder, changed.edits)
     return changed

@@ -6,8 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated
+from typing import Annotated, cast
 
+import numpy as np
 import torch
 from tyro.conf import arg
 
@@ -40,7 +41,9 @@ from nexwarp.io.json_files import JsonObject, write_json
 from nexwarp.model.compact import NOISE, NOISES
 from nexwarp.model.crop import REGIONS
 from nexwarp.model.edit import moved_poses, moved_surfels
+from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
+from nexwarp.run.edit import edited, subject_crop
 from nexwarp.run.evaluate import compared, lpips_vgg, psnr, ssim, weights_file
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, METRICS_FILE, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
 from nexwarp.train.recipe import MASK_MODES
@@ -48,9 +51,11 @@ from nexwarp.train.recipe import MASK_MODES
 # Packages that formats need, and their extras.
 PACKAGES = {"glb": ("trimesh", "glb"), "spz": ("gaussforge", "splats"), "usd": ("pxr", "usd")}
 RENDERED = ("mesh", "web", "glb", "usd")  # formats that are made of renderings, stage by stage
-BAKED = ("web", "glb", "usd")  # formats whose texture is baked, and fitted to photos
+CARDS = ("glb", "usd")  # formats for other programs, whose scenes have objects
+BAKED = ("web", *CARDS)  # formats whose texture is baked, and fitted to photos
 READ = ("web", "glb")  # of these, those that can be read back
 Figures = dict[str, dict[str, float]]  # metrics on test views, of what was baked and of the model
+GREY_LEVEL = 1 / 255
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows
 
 
@@ -68,6 +73,8 @@ class ExportOrder:
     """Of glb, usd: mask cuts surfels out, which all programs draw; blend is closer to photos, in those that sort."""
     finetune: Annotated[bool, arg(help_behavior_hint="(default: to the training photos, where they are)")] = True
     """Fit what is baked to the model's renderings alone."""
+    crop: Annotated[bool, arg(help_behavior_hint="(default: glb and usd keep what photos all around look at)")] = True
+    """Keep all surfels."""
     noise: Annotated[float | None, arg(metavar="X", help_behavior_hint="(default: 8 % of the test views' error)")] = (
         None
     )
@@ -114,24 +121,42 @@ def export_run(
     """
     order.check()
     folder = order.out or opened.folder / EXPORT_FOLDER
-    baked = order.format in BAKED
-    fitted = baked and order.finetune and opened.source is not None
-    fitted = fitted and not any(edit.name in REGIONS for edit in opened.edits)  # photos show what was cropped
-    train, test = _photos(opened, observe) if fitted else ([], [])
+    if order.crop and order.format in CARDS:
+        opened = _cropped(opened, report)
+    fitted = order.format in BAKED and order.finetune and opened.source is not None
+    train, test = _photos(opened, device, observe) if fitted else ([], [])
     files = [*_export(opened, order, folder, train, device, observe)]
     if test and order.format in READ:
         figures, size = _quality(opened, files, test, device), sum(file.stat().st_size for file in files)
-        report(_line(figures, len(test), size))
+        report(_line(figures, len(test), size, _regions(opened)))
         beside = folder.parent if folder.suffix == ".html" else folder
         known = read_metrics(beside).get("exports")
         files.append(beside / METRICS_FILE)
-        write_json(files[-1], {"exports": (known if isinstance(known, dict) else {}) | {files[0].name: {**figures}}})
+        entry = cast(JsonObject, {**figures, "cropped": _regions(opened)})
+        write_json(files[-1], {"exports": (known if isinstance(known, dict) else {}) | {files[0].name: entry}})
     # Compact models and cameras say themselves where their frame lies in the world.
     if order.format not in ("compact", "cameras") and any(opened.model.origin or ()) and opened.frame.is_identity:
         files.append((folder.parent if folder.suffix == ".html" else folder) / ORIGIN_FILE)
         meaning = "world position = origin + exported position"
         write_json(files[-1], {"origin": opened.model.origin, "meaning": meaning})
     return files
+
+
+def _cropped(opened: OpenedModel, report: Callable[[str], object]) -> OpenedModel:
+    """Return a run, of an object without what lies around it unless it is cropped already; say what is left."""
+    has_cameras = (opened.folder / CAMERAS_FILE).is_file() and opened.cameras.get(TRAIN)
+    if not has_cameras or _regions(opened) or (crop := subject_crop(opened)) is None:
+        return opened
+    rest = edited(opened, crop)
+    size = " x ".join(f"{x:.3g}" for x in np.ptp(rest.frame.points(rest.model.surfels.means.detach().numpy()), axis=0))
+    count = f"{opened.kept.sum() - rest.kept.sum():,} of {opened.kept.sum():,}"
+    report(f"{count} surfels around the subject are left out (--no-crop keeps them); the others span {size}")
+    return rest
+
+
+def _regions(opened: OpenedModel) -> bool:
+    """Whether a run is cropped."""
+    return any(edit.name in REGIONS for edit in opened.edits)
 
 
 def _export(
@@ -208,8 +233,11 @@ def _export_geometry(
         save_splats_ply(files[-1], splats)
 
 
-def _photos(opened: OpenedModel, observe: Progress) -> tuple[list[View], list[View]]:
-    """Read the training photos, with the run's poses, and the test photos of a run; none where that is impossible."""
+def _photos(opened: OpenedModel, device: torch.device | str, observe: Progress) -> tuple[list[View], list[View]]:
+    """Read the training photos, with the run's poses, and the test photos of a run; none where that is impossible.
+
+    Their masks leave out what a crop has changed.
+    """
     assert opened.source is not None
     try:
         scene = opened.source.load(lambda done, total: observe("reading photos", done, total))
@@ -222,7 +250,18 @@ def _photos(opened: OpenedModel, observe: Progress) -> tuple[list[View], list[Vi
         shown = [(view, *compared(opened.model, view, mode)) for view in views]
         groups.append([replace(view, image=image, mask=mask) for view, image, mask in shown])
     cameras = opened.cameras.get(TRAIN, {}) if (opened.folder / CAMERAS_FILE).is_file() else {}
-    return [replace(view, camera=cameras.get(view.name, view.camera)) for view in groups[0]], groups[1]
+    groups[0] = [replace(view, camera=cameras.get(view.name, view.camera)) for view in groups[0]]
+    if _regions(opened):
+        models = [model.bare().to(device) for model in (opened.trained, opened.model)]
+        groups = [[_masked(view, *models) for view in group] for group in groups]
+    return groups[0], [view for view in groups[1] if view.mask is None or view.mask.any()]
+
+
+def _masked(view: View, whole: Model, part: Model) -> View:
+    """Return a view that leaves out the pixels where two models differ by a grey level or more."""
+    before, after = (model.render_image(view.camera.to(model.device)).cpu() for model in (whole, part))
+    same = ((after - before).abs() < GREY_LEVEL).all(dim=2)
+    return replace(view, mask=same if view.mask is None else same & view.mask)
 
 
 @torch.no_grad()
@@ -251,13 +290,14 @@ def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], 
     return figures
 
 
-def _line(figures: Figures, views: int, size: int) -> str:
+def _line(figures: Figures, views: int, size: int, cropped: bool) -> str:
     """Return what a person reads of them."""
     psnr, lpips = (
         ", ".join(f"{each[metric]:.{digits}f}{unit} {name}" for name, each in figures.items() if metric in each)
         for metric, digits, unit in (("psnr", 2, " dB"), ("lpips", 3, ""))
     )
-    return f"test PSNR: {psnr}, {views} views; {size / 1e6:.1f} MB" + (f"; LPIPS: {lpips}" if lpips else "")
+    where = " where nothing was cropped" if cropped else ""
+    return f"test PSNR{where}: {psnr}, {views} views; {size / 1e6:.1f} MB" + (f"; LPIPS: {lpips}" if lpips else "")
 
 
 def _noise(opened: OpenedModel) -> float:

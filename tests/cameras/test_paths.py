@@ -18,10 +18,12 @@ from nexwarp.cameras.paths import (
     interpolate,
     look_at,
     spiral,
+    subject,
     suited_path,
     through,
     up_direction,
 )
+from tests.narrowing import present
 from tests.tolerances import assert_close
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -247,6 +249,17 @@ def test_an_ellipse_suits_cameras_around_a_subject_that_they_look_at() -> None:
     aside = [camera(place, place + torch.linalg.cross(place, UP)) for place in positions(walk())]
     for others in (walk(arc=math.pi), row(), outwards, aside, [ONE], []):
         assert suited_path(others) == "interpolate"
+
+
+def test_a_subject_is_what_cameras_all_around_have_in_their_middle() -> None:
+    cameras = ring(count=60)
+    centre, radius = present(subject(cameras))
+    assert_close(centre, focus(cameras), kind="value", name="centre")
+    depths = [(each.viewmat[:3, :3] @ centre + each.viewmat[:3, 3])[2].item() for each in cameras]
+    assert radius == pytest.approx(float(np.median(depths)) * 64 / 90 / 2)
+    beside = [each.crop(22, 0, 42, 48) for each in cameras]
+    assert suited_path(beside) == "ellipse" and subject(beside) is None
+    assert all(subject(others) is None for others in (walk(arc=math.pi), row(), [ONE], []))
 
 
 ONE = camera(torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))

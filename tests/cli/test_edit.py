@@ -214,7 +214,7 @@ def test_damaged_edits_are_named_by_every_command(finished, capsys):
 
 
 def test_baked_exports_move_too(finished, monkeypatch):
-    """Cards, and their pictures from the moved cameras; photos of what was cropped are not fitted."""
+    """Cards, and their pictures from the moved cameras."""
     pytest.importorskip("trimesh")
     monkeypatch.setattr("nexwarp.export.fit.FEWEST_STEPS", 2)
     monkeypatch.setattr("nexwarp.export.glb.CUTOFF", 0.05)  # surfels of a short training are faint
@@ -232,6 +232,5 @@ def test_baked_exports_move_too(finished, monkeypatch):
     image = after.render(opened.frame.camera(camera))
     assert_close(image, before.render(camera), kind="gradient", name="image", allow_flips=0.005)
     edit(finished, "--crop", "box", *map(str, np.quantile(expected, (0.1, 0.9), axis=0).ravel()))
-    monkeypatch.setattr("nexwarp.run.export._photos", None)
     assert cli.main(command) == 0
     assert 0 < len(load_baked(file).shape.means) < len(expected)

@@ -5,14 +5,17 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from PIL import Image, ImageOps
 
 from nexwarp.cli import main as cli
+from nexwarp.export.baked_scene import load_baked
 from nexwarp.export.web import baked
-from nexwarp.run.export import ExportOrder, export_run
+from nexwarp.run.export import ExportOrder, _photos, export_run
 from nexwarp.run.folder import open_model, read_metrics
-from tests.cli.support import refused
+from tests.cli.support import read, refused
 from tests.narrowing import present
 
 
@@ -50,6 +53,52 @@ def test_a_finished_run_becomes_gltf_usd_and_spz(finished, monkeypatch, capsys):
             patch.setattr("importlib.util.find_spec", lambda name: None)
             refused(capsys, ["export", str(finished), "--format", kind, "--device", "cpu"], package, "pip install")
         assert not (finished / "export" / name).exists()
+
+
+def test_gltf_of_an_object_holds_the_subject_alone(finished, monkeypatch):
+    """In the new coordinates; unless it is told to hold all, or what was cropped before."""
+    pytest.importorskip("trimesh")
+    monkeypatch.setattr("nexwarp.export.glb.CUTOFF", 0.05)  # surfels of a short training are faint
+    monkeypatch.setattr("nexwarp.run.edit.subject", lambda cameras: (torch.tensor([0.5, 0, 0]).double(), 1.0))
+    assert cli.main(["edit", str(finished), "--scale", "2"]) == 0
+    opened = open_model(finished)
+    means, lines = opened.frame.points(opened.model.surfels.means.detach().numpy()), list[str]()
+    near = np.linalg.norm(means - [1, 0, 0], axis=1) <= 2
+    assert 0 < near.sum() < len(near)
+
+    def exported(crop: bool = True) -> np.ndarray:
+        file = export_run(open_model(finished), ExportOrder("glb", crop=crop), report=lines.append)[0]
+        return load_baked(file).shape.means.numpy()
+
+    assert (np.linalg.norm(exported() - [1, 0, 0], axis=1) <= 2.001).all()
+    size = [float(x) for x in re.findall(r"[\d.]+", lines[0].partition("span")[2])]
+    assert lines[0].startswith(f"{(~near).sum()} of {len(near)} surfels") and len(lines) == 2
+    assert np.allclose(size, np.ptp(means[near], axis=0), rtol=0.01)
+    assert "where nothing was cropped" in lines[1]
+    assert (np.linalg.norm(exported(crop=False) - [1, 0, 0], axis=1) > 2.001).any() and len(lines) == 3
+    assert cli.main(["edit", str(finished), "--crop", "box", "-50", "-50", "-50", "50", "50", "0.1"]) == 0
+    assert (np.linalg.norm(exported() - [1, 0, 0], axis=1) > 2.001).any() and len(lines) == 4
+
+
+def test_a_cropped_export_learns_from_the_pixels_that_show_what_is_left(finished, tmp_path):
+    assert cli.main(["edit", str(finished), "--crop", "sphere", "0", "0", "0", "6"]) == 0
+    source = present(open_model(finished).source)
+    views = {view.name: view for group in _photos(open_model(finished), "cpu", lambda *_: None) for view in group}
+    shares = [present(view.mask).double().mean().item() for view in views.values()]
+    assert 0.2 < np.mean(shares) < 0.8
+    results = {"as it is": baked_files(finished)}
+    for inverted in ("beside", "inside"):
+        scene = shutil.copytree(source.path, tmp_path / inverted)
+        for name, view in views.items():
+            file = scene / source.images / name
+            with Image.open(file) as photo:
+                pixels = np.array(photo.convert("RGB"))
+            where = present(view.mask).numpy() == (inverted == "inside")
+            pixels[where] = 255 - pixels[where]
+            Image.fromarray(pixels).save(file)
+        results[inverted] = baked_files(finished, path=str(scene))
+    assert results["beside"] == results["as it is"]
+    assert results["inside"][0] != results["as it is"][0] and results["inside"][1] != results["as it is"][1]
 
 
 @pytest.mark.parametrize(
@@ -95,7 +144,8 @@ def test_an_export_learns_from_training_photos_alone(finished, tmp_path):
     """And tells the PSNR of what was written on the test photos."""
     source = present(open_model(finished).source)
     results = {"as it is": baked_files(finished)}
-    figures = read_metrics(finished / "page")["exports"]["index.html"]
+    figures = read(finished / "page", "metrics.json")["exports"]["index.html"]
+    assert not figures["cropped"]
     for group in ("test", "train"):
         scene = shutil.copytree(source.path, tmp_path / group)
         for name in open_model(finished).cameras[group]:
