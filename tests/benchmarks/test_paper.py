@@ -10,17 +10,14 @@ import pytest
 from benchmarks.paper import (
     BUDGETS,
     DIGITS,
-    FINE,
     GROUPS,
     NO_LPIPS,
     PUBLISHED,
     SCENES,
     main,
-    make_parser,
     mean,
     published,
     table,
-    wanted_jobs,
 )
 from benchmarks.quality.jobs import TrainingJob
 from benchmarks.timing import ROOT
@@ -88,28 +85,6 @@ def test_rows_say_the_size_of_photos_and_groups_have_means() -> None:
     assert lines[-1].startswith("| mean of Tanks & Temples | 400,000 | 23.55")
 
 
-@pytest.mark.parametrize(
-    ("options", "rows"),
-    [
-        ("", ["paper", FINE.name, FINE.name]),
-        ("--preset default", ["default"] * 3),
-        ("--preset default --raw", ["raw"] * 3),
-    ],
-)
-def test_presets_budgets_and_photos(tmp_path: Path, options: str, rows: list[str]) -> None:
-    for scene in ("kitchen/images_2", "truck", "graffiti", "kitchen25"):
-        (tmp_path / scene).mkdir(parents=True)
-    jobs = wanted_jobs(make_parser().parse_args(["--data", str(tmp_path), *options.split()]))
-    few = [("graffiti", size) for size in BUDGETS[:3]]
-    assert [*jobs] == [*(("kitchen", size) for size in BUDGETS), ("truck", 400_000), *few]
-    assert [jobs[scene, 400_000].row for scene in ("kitchen", "truck", "graffiti")] == rows
-    assert [jobs[scene, 400_000].images for scene in ("kitchen", "truck", "graffiti")] == [
-        "images_2",
-        "images",
-        "images",
-    ]
-
-
 def test_one_command_trains_what_is_there_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = write_demo(tmp_path / "data" / "kitchen", width=48, height=36, views=12, points=200)
     (scene / "images").rename(scene / "images_2")
@@ -126,10 +101,3 @@ def test_one_command_trains_what_is_there_once(tmp_path: Path, capsys: pytest.Ca
     assert main(command) == 0 and out.read_text() == line + "\n"
     again = capsys.readouterr().out
     assert "0 of 1 trainings to do" in again and row in again
-
-
-def test_no_scene_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=r"^--data: expected a folder named bonsai, .*, tripod, found none at \S+$"):
-        main(["--data", str(tmp_path)])
-    with pytest.raises(SystemExit, match=r"^--data: expected a folder of scenes, found none at \S+nowhere$"):
-        main(["--data", str(tmp_path / "nowhere")])

@@ -11,12 +11,11 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from benchmarks.peer_gsplat import PeerSettings
 from benchmarks.quality import curve
 from benchmarks.quality.__main__ import main
-from benchmarks.quality.documents import MISSING, blocks, fill
-from benchmarks.quality.jobs import FOLDS, PEERS, ROWS, TABLES, Row, TrainingJob, config_of, scene_of, table_jobs
-from benchmarks.quality.results import Results, drop_unfinished, read_results, table
+from benchmarks.quality.documents import MISSING, blocks
+from benchmarks.quality.jobs import FOLDS, PEERS, Row, TrainingJob, config_of, scene_of
+from benchmarks.quality.results import Results, read_results, table
 from benchmarks.timing import ROOT
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.stages import StageRunner
@@ -31,13 +30,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("scenes")
     write_demo(path / "tiny", width=48, height=36, views=12, points=200)
     return path
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_tables_are_made_of_known_rows(name: str) -> None:
-    jobs = list(table_jobs(name, ("fox", "saharov"), (0, 1), 100))
-    assert len(jobs) == len(set(jobs)) > 0
-    assert all(job.row in ROWS and job.iterations == 100 for job in jobs) and {job.seed for job in jobs} == {0, 1}
 
 
 def test_validation_views_are_training_views(folder: Path) -> None:
@@ -103,13 +95,6 @@ def test_a_curve_has_points_at_its_times_and_at_the_end(
         curve.draw([], out)
 
 
-def test_an_unfinished_line_is_cut_off(tmp_path: Path) -> None:
-    path = tmp_path / "out.jsonl"
-    path.write_text('{"a": 1}\n{"scene": "ti')
-    assert drop_unfinished(path) and path.read_text() == '{"a": 1}\n'
-    assert not drop_unfinished(path)
-
-
 def line(scene: str, row: str, size: int, psnr: float, seed: int = 0) -> dict[str, Any]:
     figures: dict[str, object] = {"psnr": psnr, "ssim": 0.9, "flip": 0.1, "lpips": None, "megabytes": 2.0}
     facts: dict[str, object] = {"date": "2026-11-25", "device": "H200", "seconds": 5.0}
@@ -141,14 +126,6 @@ def test_the_best_gsplat_row_of_each_scene_is_the_peer(tmp_path: Path) -> None:
     assert "| fox | 40,000 | 30,000 | default | 32.40 ± 0.14 |" in table(results)
 
 
-def test_only_marked_blocks_are_filled() -> None:
-    page = "a\n<!-- results: readme -->\nold\n<!-- end of results -->\nb\n"
-    assert fill(page, {"readme": "new"}) == page.replace("old", "new")
-    for wrong in ("none", page.replace("readme", "another")):
-        with pytest.raises(ValueError, match="expected lines <!-- results: NAME -->"):
-            fill(wrong, {"readme": "new"})
-
-
 def test_the_documents_have_the_kept_figures(tmp_path: Path) -> None:
     """The pages are what `publish` makes of the kept results."""
     results = ROOT / "benchmarks" / "results" / "quality.jsonl"
@@ -157,12 +134,3 @@ def test_the_documents_have_the_kept_figures(tmp_path: Path) -> None:
         page.write_text((ROOT / name).read_text(encoding="utf-8"), encoding="utf-8")
         assert main(["publish", str(results), "--page", str(page)]) == 0
         assert page.read_text(encoding="utf-8") == (ROOT / name).read_text(encoding="utf-8"), name
-
-
-def test_settings_of_the_peers_are_checked() -> None:
-    for row in PEERS:
-        PeerSettings(**row.settings)
-    with pytest.raises(ValueError, match="strategy: expected default for 2dgs, got mcmc"):
-        PeerSettings(primitive="2dgs")
-    with pytest.raises(ValueError, match="primitive: expected one of 3dgs, 2dgs, got '4dgs'"):
-        PeerSettings(primitive="4dgs")

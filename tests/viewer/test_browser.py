@@ -1,19 +1,14 @@
 """The viewer in a browser."""
 
 import io
-import json
 import shutil
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from nexwarp.run.folder import keep_camera_path
-from nexwarp.viewer.session import Session
-from nexwarp.viewer.world import camera_to_world
 from tests.viewer.support import serving, wait_for
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -23,37 +18,12 @@ FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
-def record_and_save(page: Any, session: Session, folder: Path) -> None:
-    """Add two views to a path, save it and a screenshot; the run keeps the path."""
-    assert session.viewpoint is not None
-    page.get_by_role("tab", name="Record").click()
-    page.get_by_role("button", name="Add this view").click()
-    wait_for(lambda: len(session.path.views) == 1)
-    session.jump("train/4.png")
-    expected = camera_to_world(session.cameras["train/4.png"])
-    wait_for(lambda: session.viewpoint is not None and np.allclose(session.viewpoint.pose, expected, atol=1e-3))
-    page.get_by_role("button", name="Add this view").click()
-    wait_for(lambda: len(session.path.views) == 2)
-    page.get_by_role("button", name="Save path").click()
-    page.get_by_text("nexwarp render").last.wait_for()
-    saved = json.loads((folder / "camera_path_1.json").read_text())
-    assert len(saved["camera_path"]) == 180 and (saved["render_width"], saved["render_height"]) == (64, 48)
-    with page.expect_download() as shot:
-        page.get_by_role("button", name="Save screenshot").click()
-    with Image.open(shot.value.path()) as png:
-        assert png.format == "PNG" and png.height == 1080
-        assert png.width == pytest.approx(1080 * session.viewpoint.width / session.viewpoint.height, abs=1)
-
-
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 @pytest.mark.timeout(180)
-def test_in_a_browser(model, tmp_path, monkeypatch):
+def test_in_a_browser(model, monkeypatch):
     api = pytest.importorskip("playwright.sync_api")
     errors: list[str] = []
-    with (
-        serving(model, save_path=lambda path: keep_camera_path(tmp_path, path)) as viewer,
-        api.sync_playwright() as playwright,
-    ):
+    with serving(model) as viewer, api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(viewport={"width": 900, "height": 700})
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
@@ -118,7 +88,11 @@ def test_in_a_browser(model, tmp_path, monkeypatch):
         settled()
         assert session.viewpoint is not None
         assert not np.allclose(session.viewpoint.pose, session.home.pose, atol=1e-3), "dragging moves the camera"
-        record_and_save(page, session, tmp_path)
+        page.get_by_role("tab", name="Record").click()
+        with page.expect_download() as shot:
+            page.get_by_role("button", name="Save screenshot").click()
+        with Image.open(shot.value.path()) as png:
+            assert png.format == "PNG" and png.height == 1080
         browser.close()
         wait_for(lambda: not viewer.sessions)
     assert not errors, errors
