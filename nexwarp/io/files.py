@@ -118,27 +118,12 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def write_together(contents: Mapping[Path, bytes]) -> None:
-    """Write files, the first one last, by their paths; where one cannot be written, none is there that was not before.
-
-    The disk has stored all contents before the first of them replaces an older file.
-    """
-    absent = [path for path in contents if not path.exists()]
-    created: list[Path] = []
-    try:
-        for path in contents:
-            created += make_folders(path.parent)
-        with ExitStack() as stack:
-            for path, content in contents.items():
-                temporary = stack.enter_context(written_aside(path, durable=False))
-                temporary.write_bytes(content)
-                sync(temporary)
-        for folder in {path.parent for path in contents}:
-            sync(folder)
-    except BaseException:
-        for path in absent:
-            path.unlink(missing_ok=True)
-        remove_empty(sorted(created, reverse=True))
-        raise
+    """Write files by their paths, the first one last; nothing changes before the disk has stored all contents."""
+    with ExitStack() as stack:
+        for path, content in contents.items():
+            temporary = stack.enter_context(written_aside(path))
+            temporary.write_bytes(content)
+            sync(temporary)
 
 
 def sync(path: Path) -> None:

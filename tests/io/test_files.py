@@ -83,20 +83,19 @@ def test_camera_paths_of_viewers_at_the_same_time_all_stay(tmp_path):
 
 
 def test_files_written_together_are_all_there_or_none(tmp_path):
-    """A new folder is gone after any fault; older files stay as long as the disk has not stored all new ones."""
-    new, old = tmp_path / "new", tmp_path / "old"
-    for folder in (new, old):
-        contents = {folder / "index.html": b"page", folder / "shaders" / "a.wgsl": b"a", folder / "b.js": b"b"}
-        for _ in range(1 if folder == new else 2):  # folders are made once
-            with failing(Disk(folder)) as counted:
-                write_together(contents)
-        requests = counted.requests
-        replaced = next(i for i, request in enumerate(requests) if request.startswith("replace"))
-        assert [r for r in requests if r.startswith("replace")][-1] == "replace index.html", "the page comes last"
-        for fatal in range(len(requests) if folder == new else replaced):
-            if folder == new:
-                shutil.rmtree(new, ignore_errors=True)
+    """A new folder is gone, and older files stay, as long as the disk has not stored all new ones."""
+    folder = tmp_path / "page"
+    contents = {folder / "index.html": b"page", folder / "shaders" / "a.wgsl": b"a", folder / "b.js": b"b"}
+    for before in ({}, contents):
+        write_together(before)
+        with failing(Disk(folder)) as counted:
+            write_together(contents)
+        replaced = [i for i, request in enumerate(counted.requests) if request.startswith("replace")]
+        assert counted.requests[replaced[-1]] == "replace index.html", "the page comes last"
+        for fatal in range(replaced[0]):
+            if not before:
+                shutil.rmtree(folder, ignore_errors=True)
             with failing(Disk(folder, fatal)), pytest.raises(OSError):
                 write_together({path: b"newer" for path in contents})
             left = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-            assert left == ({} if folder == new else contents) and folder.exists() == (folder == old), requests[fatal]
+            assert left == before and folder.exists() == bool(before), counted.requests[fatal]
