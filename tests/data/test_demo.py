@@ -5,18 +5,12 @@ import torch
 
 from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.data.scene import SceneSource
+from tests.export.web.support import bilinear
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     return load_scene(demo_folder())
-
-
-def bilinear(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
-    """(P, 3) values in [0, 255] of an image (H, W, 3) at pixel coordinates (P, 2), pixel centres at +0.5."""
-    grid = 2 * pixels / torch.tensor([image.shape[1], image.shape[0]]) - 1
-    planes = image.float().permute(2, 0, 1)[None]
-    return torch.nn.functional.grid_sample(planes, grid[None, None].float(), align_corners=False)[0, :, 0].T
 
 
 def test_the_demo_is_small_and_general(scene: Scene) -> None:
@@ -36,7 +30,9 @@ def test_points_reproject_onto_their_colors(scene: Scene) -> None:
         size = torch.tensor([view.camera.width, view.camera.height])
         inside = (pixels > 1).all(dim=1) & (pixels < size - 1).all(dim=1) & (depths > view.camera.near)
         error = torch.full((len(scene.points),), float("nan"))
-        error[inside] = (bilinear(view.image, pixels[inside]) - scene.colors[inside].float()).abs().mean(dim=1)
+        error[inside] = (
+            (bilinear(view.image.float(), pixels[inside] - 0.5) - scene.colors[inside].float()).abs().mean(dim=1)
+        )
         errors.append(error)
     # A point is seen by a few of the views that have it in frame; in the best three of them it must match.
     best = torch.stack(errors).nan_to_num(nan=255.0).sort(dim=0).values[:3].amax(dim=0)

@@ -2,25 +2,19 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from nexwarp.io.pictures import error_map, save_exr, save_png, side_by_side, to_uint8
-
-
-def read(path: Path) -> torch.Tensor:
-    with Image.open(path) as picture:
-        return torch.from_numpy(np.array(picture))
+from tests.cli.support import picture
 
 
 def test_png_returns_what_was_saved(tmp_path: Path, device: torch.device) -> None:
     image = torch.rand(7, 9, 3, device=device) * 1.4 - 0.2
     save_png(tmp_path / "new" / "a.png", image.requires_grad_())
-    assert read(tmp_path / "new" / "a.png").equal(to_uint8(image).cpu())
+    assert picture(tmp_path / "new" / "a.png").equal(to_uint8(image).cpu())
     save_png(tmp_path / "new" / "a.png", to_uint8(image).flip(0))
-    assert read(tmp_path / "new" / "a.png").equal(to_uint8(image).cpu().flip(0))
+    assert picture(tmp_path / "new" / "a.png").equal(to_uint8(image).cpu().flip(0))
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["a.png"]
     with pytest.raises(ValueError, match=r"image: expected shape \(H, W, 3\), got \(7, 9\)"):
         save_png(tmp_path / "b.png", image[..., 0])

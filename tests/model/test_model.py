@@ -6,10 +6,8 @@ import itertools
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import nexwarp as nw
 from nexwarp import ops
@@ -25,6 +23,7 @@ from nexwarp.model.render import draw
 from nexwarp.model.texture import DetailLimits
 from nexwarp.run.folder import RunRecord, create_run
 from nexwarp.train.recipe import Config
+from tests.cli.support import picture
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_finite
 
@@ -66,11 +65,6 @@ def assert_same(one: nw.Rendering, other: nw.Rendering, names: tuple[str, ...] =
 def pure(model: nw.Model, camera: nw.Camera, **parts: Any) -> nw.Rendering:
     """The rendering of a model's surfels and texture, with the given parts only."""
     return draw(model.surfels, model.texture, camera, model.options, **parts)
-
-
-def picture(file: Path) -> torch.Tensor:
-    with Image.open(file) as image:
-        return torch.from_numpy(np.array(image))
 
 
 # What is rendered

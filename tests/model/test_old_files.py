@@ -15,6 +15,7 @@ import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.run.folder import read_metrics, read_run
+from tests.cli.support import refused
 from tests.tolerances import assert_close
 
 OLD = Path(__file__).parents[1] / "old_files"
@@ -43,13 +44,6 @@ EVERY_RUN = pytest.mark.parametrize(
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """A copy of an old run."""
     return Path(shutil.copytree(OLD / request.param, tmp_path / request.param))
-
-
-def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], message: str) -> None:
-    capsys.readouterr()
-    assert cli.main(arguments) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
 
 
 def rendered(run: Path) -> torch.Tensor:

@@ -5,15 +5,14 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import nexwarp as nw
 from nexwarp.data import View
 from nexwarp.io.pictures import CAPTION_HEIGHT, error_map, to_uint8
 from nexwarp.run.evaluate import CONVENTION, evaluate, ssim
+from tests.cli.support import picture
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 
 WIDTH, HEIGHT, GAP = 40, 30, 4
@@ -24,12 +23,6 @@ NAMES = ("a.png", "deep/er/b.c.jpg")
 @pytest.fixture(scope="module")
 def model() -> nw.Model:
     return nw.Model(make_surfels(random_scene(24, width=WIDTH, height=HEIGHT)), make_texture(), options=OPTIONS)
-
-
-def read(file: Path) -> torch.Tensor:
-    with Image.open(file) as image:
-        assert image.mode == "RGB"
-        return torch.from_numpy(np.array(image))
 
 
 def views_of(model: nw.Model) -> list[View]:
@@ -57,11 +50,11 @@ def test_figures_are_those_of_the_written_pictures(tmp_path, model):
     assert done == list(NAMES) == list(result["views"])
     assert result["convention"] == CONVENTION
     for view in views:
-        picture = read(tmp_path / "test" / Path(view.name).with_suffix(".png"))
-        assert torch.equal(picture, rendered(model, view.camera))
+        written = picture(tmp_path / "test" / Path(view.name).with_suffix(".png"))
+        assert torch.equal(written, rendered(model, view.camera))
         figures = result["views"][view.name]
-        assert figures["psnr"] == pytest.approx(psnr_of(picture, view.image), abs=1e-5)
-        assert figures["ssim"] == pytest.approx(ssim(picture, view.image), abs=1e-9)
+        assert figures["psnr"] == pytest.approx(psnr_of(written, view.image), abs=1e-5)
+        assert figures["ssim"] == pytest.approx(ssim(written, view.image), abs=1e-9)
     each: list[Any] = [result["views"][name] for name in NAMES]
     first, second = each
     assert first["psnr"] > second["psnr"] + 5 and first["ssim"] > second["ssim"]
@@ -73,11 +66,11 @@ def test_strips_show_photo_render_and_error(tmp_path, model):
     views = views_of(model)
     evaluate(model, views, renders=tmp_path)
     for view in views:
-        strip = read(tmp_path / "compare" / Path(view.name).with_suffix(".png"))
+        strip = picture(tmp_path / "compare" / Path(view.name).with_suffix(".png"))
         assert strip.shape == (HEIGHT + CAPTION_HEIGHT, 3 * WIDTH + 2 * GAP, 3)
         panels = [strip[CAPTION_HEIGHT:, i * (WIDTH + GAP) : i * (WIDTH + GAP) + WIDTH] for i in range(3)]
-        picture = rendered(model, view.camera)
-        for panel, expected in zip(panels, [view.image, picture, error_map(picture, view.image)], strict=True):
+        render = rendered(model, view.camera)
+        for panel, expected in zip(panels, [view.image, render, error_map(render, view.image)], strict=True):
             assert torch.equal(panel, expected)
         assert (strip[:, WIDTH : WIDTH + GAP] == 255).all() and (strip[:CAPTION_HEIGHT] < 128).any()
     files = sorted(str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file())

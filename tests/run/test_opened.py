@@ -15,16 +15,11 @@ from nexwarp.io.json_files import read_json
 from nexwarp.run.evaluate import METRICS, evaluate
 from nexwarp.run.folder import near_depth, open_model
 from nexwarp.train.trainer import Trainer
-from tests.scene_writers import write_demo
+from tests.cli.support import refused
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.trainer_support import small
 
 SIZE = ["--size", "32x24", "--device", "cpu"]
-
-
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=48, height=36, views=10, points=200)
 
 
 @pytest.fixture
@@ -32,18 +27,9 @@ def model() -> nw.Model:
     return nw.Model(make_surfels(random_scene(30)), make_texture(), options=nw.RenderOptions(sh_degree=2))
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """Return the one line on stderr of a command that exits with 2."""
-    capsys.readouterr()
-    assert cli.main([str(argument) for argument in arguments]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1, err
-    return err
-
-
 @pytest.mark.parametrize("name", ["folder", "scene.safetensors"])
 def test_a_saved_model_opens_everywhere(
-    name: str, model: nw.Model, demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, model: nw.Model, tiny_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     saved = tmp_path / name
     model.save(saved)
@@ -54,29 +40,27 @@ def test_a_saved_model_opens_everywhere(
     assert [f.name for f in sorted((results / "renders" / "ellipse").iterdir())] == ["0000.png", "0001.png", "0002.png"]
     assert cli.main(["export", str(saved)]) == 0
     assert {f.name for f in (results / "export").iterdir()} == {"surfels.ply", "splats.ply"}
-    assert "give --scene SCENE" in refused(capsys, "eval", saved)
-    assert "expected test views to render, found none" in refused(capsys, "render", saved, "--set", "test")
-    assert cli.main(["eval", str(saved), "--scene", str(demo), "--device", "cpu"]) == 0
+    refused(capsys, ["eval", str(saved)], "give --scene SCENE")
+    refused(capsys, ["render", str(saved), "--set", "test"], "expected test views to render, found none")
+    assert cli.main(["eval", str(saved), "--scene", str(tiny_folder), "--device", "cpu"]) == 0
     metrics = json.loads((results / "metrics.json").read_text())
-    views = nw.load_scene(demo).test
+    views = nw.load_scene(tiny_folder).test
     assert metrics["psnr"] == pytest.approx(evaluate(nw.load(saved), views)["psnr"])
 
 
-def test_views_that_equal_their_photos_have_no_infinity_in_their_metrics(
-    model: nw.Model, demo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_photos_that_are_met_exactly_leave_no_infinity(model, tiny_folder, tmp_path, monkeypatch, capsys):
     """JSON has none: null stands for it, and is shown as what it is."""
     model.save(tmp_path / "model")
     monkeypatch.setitem(METRICS, "psnr", lambda *_: math.inf)
-    assert cli.main(["eval", str(tmp_path / "model"), "--scene", str(demo), "--device", "cpu"]) == 0
+    assert cli.main(["eval", str(tmp_path / "model"), "--scene", str(tiny_folder), "--device", "cpu"]) == 0
     metrics = read_json(tmp_path / "model" / "metrics.json", finite=True)
     assert metrics["psnr"] is None and {view["psnr"] for view in metrics["views"].values()} == {None}
     assert cli.main(["info", str(tmp_path / "model")]) == 0
     assert capsys.readouterr().out.count("inf dB") == 2
 
 
-def test_a_trainer_saves_what_the_commands_open_and_what_it_restores(demo: Path, tmp_path: Path) -> None:
-    scene, config = nw.load_scene(demo), small(iterations=4)
+def test_a_trainer_saves_what_the_commands_open_and_what_it_restores(tiny_folder: Path, tmp_path: Path) -> None:
+    scene, config = nw.load_scene(tiny_folder), small(iterations=4)
     trainer = Trainer(scene, config, "cpu")
     trainer.run(until=2)
     folder = tmp_path / "new" / "folder"
@@ -86,7 +70,7 @@ def test_a_trainer_saves_what_the_commands_open_and_what_it_restores(demo: Path,
     assert opened.cameras["test"].keys() == {view.name for view in scene.test}
     assert near_depth(opened.model) == pytest.approx(scene.train[0].camera.near)
     assert cli.main(["render", str(folder), "--set", "test", "--device", "cpu"]) == 0
-    assert cli.main(["eval", str(folder), "--scene", str(demo), "--device", "cpu"]) == 0
+    assert cli.main(["eval", str(folder), "--scene", str(tiny_folder), "--device", "cpu"]) == 0
     again = Trainer(scene, config, "cpu")
     again.restore(folder)
     for each in (trainer, again):
@@ -109,20 +93,13 @@ def test_the_ring_around_a_scene_sees_its_middle() -> None:
 @pytest.mark.parametrize(
     ("metric", "remedy"), [("flip", "pip install 'nexwarp[flip]'"), ("lpips", "python -m benchmarks.lpips_weights")]
 )
-def test_a_metric_without_its_package_is_one_line(
-    metric: str,
-    remedy: str,
-    model: nw.Model,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_metric_without_its_package_is_one_line(metric, remedy, model, tmp_path, monkeypatch, capsys):
     model.save(tmp_path / "run")
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     monkeypatch.setenv("NEXWARP_LPIPS", str(tmp_path / "vgg16.safetensors"))
     monkeypatch.setitem(sys.modules, "lpips", None)
-    line = refused(capsys, "eval", tmp_path / "run", "--scene", "nowhere", "--metrics", metric)
-    assert f"--metrics: {metric}" in line and remedy in line
+    command = ["eval", str(tmp_path / "run"), "--scene", "nowhere", "--metrics", metric]
+    refused(capsys, command, f"--metrics: {metric}", remedy)
 
 
 def test_a_model_beside_a_run_of_its_name_leaves_the_run_alone(model: nw.Model, tmp_path: Path) -> None:

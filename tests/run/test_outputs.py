@@ -5,10 +5,8 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import nexwarp as nw
 from nexwarp.cameras.camera import resized
@@ -26,6 +24,7 @@ from nexwarp.model.options import RenderOptions
 from nexwarp.run.folder import RunRecord, create_run
 from nexwarp.train.recipe import Config
 from tests.cameras.test_paths import ring, row
+from tests.cli.support import picture, refused
 from tests.data.inputs import room
 from tests.scenes import make_surfels, make_texture, random_scene
 
@@ -60,11 +59,6 @@ def command(*arguments: object) -> int:
 
 def files(folder: Path) -> set[str]:
     return {str(f.relative_to(folder)) for f in folder.rglob("*") if f.is_file()}
-
-
-def picture(file: Path) -> torch.Tensor:
-    with Image.open(file) as image:
-        return torch.from_numpy(np.array(image))
 
 
 def rendered(run: Path, camera: nw.Camera) -> torch.Tensor:
@@ -282,12 +276,8 @@ def refuses(run: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., None
 
     def check(arguments: list[object], *words: str) -> None:
         before = files(run.parent)
-        capsys.readouterr()
-        assert command(arguments[0], run, *arguments[1:]) == 2
-        err = capsys.readouterr().err
-        assert err.startswith("nexwarp: error: ") and err.count("\n") == 1, err
-        assert all(word in err for word in words), err
-        assert files(run.parent) == before and not (run / "renders").exists() and not (run / "export").exists()
+        refused(capsys, [str(word) for word in (arguments[0], run, *arguments[1:])], *words)
+        assert files(run.parent) == before
 
     return check
 

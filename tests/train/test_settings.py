@@ -25,6 +25,7 @@ from nexwarp.train.recipe import (
     setting,
     with_settings,
 )
+from tests.cli.support import refused
 from tests.scene_writers import write_blender, write_demo
 
 SHAPE = ["--set", "texture.levels=4", "--set", "texture.table_size=256", "--set", "texture.width=16"]
@@ -42,15 +43,6 @@ def run(scene, tmp_path_factory) -> Path:
     extra = ["--set", "mask_mode=background", "--set", "rates.means=[1e-4, 1e-6]", "--set", "skybox=90"]
     assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, *extra]) == 0
     return run
-
-
-def refused(capsys: pytest.CaptureFixture[str], arguments: list[str], *words: str) -> None:
-    """Fail unless the command exits with 2 and one line on stderr that holds all of `words`."""
-    capsys.readouterr()
-    assert cli.main(arguments) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1, err
-    assert all(word in err for word in words), err
 
 
 # In Python
