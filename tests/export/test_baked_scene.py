@@ -59,7 +59,8 @@ def in_double(scene: BakedScene) -> BakedScene:
     """The scene in float64, without detail limits."""
     values = {name: getattr(scene, name).double() for name in ("texels", "rects", "boxes")}
     shape = type(scene.shape)(*(x.double() for x in scene.shape))
-    harmonics = None if scene.harmonics is None else tuple(x.double() for x in scene.harmonics)
+    sh = scene.harmonics
+    harmonics = None if sh is None else (sh[0].double(), sh[1].double())
     return dataclasses.replace(scene, shape=shape, harmonics=harmonics, limits=None, **values)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from PIL import Image, ImageCms
+from PIL import Image
 
 from nexwarp.data import load_scene
 from tests.data.inputs import room
@@ -55,7 +55,7 @@ def tiff(file, photo, dtype="<u1", scale=1.0, photometric=2, more=None):
     values = values if dtype[1] == "f" else np.round(values)
     if more is not None:
         values = np.concatenate([values, np.full((*values.shape[:2], 1), more[1])], axis=-1)
-    options = {} if more is None else {"extrasamples": [more[0]], "planarconfig": 1}
+    options: dict[str, Any] = {} if more is None else {"extrasamples": [more[0]], "planarconfig": 1}
     values = values.squeeze().astype(dtype)
     tifffile.imwrite(file, values, byteorder=">" if dtype[0] == ">" else "<", photometric=photometric, **options)
 
@@ -81,13 +81,6 @@ def pfm(file, photo):
     file.write_bytes(f"Pf\n{room.WIDTH} {room.HEIGHT}\n-1.0\n".encode() + values.tobytes())
 
 
-def lab(file, photo):
-    profiles = ImageCms.createProfile("sRGB"), ImageCms.createProfile("LAB")
-    image = ImageCms.profileToProfile(Image.fromarray(photo), *profiles, outputMode="LAB")
-    assert image is not None
-    image.save(file)
-
-
 def bits(file, photo, **options):
     Image.fromarray(one_bit(photo)[..., 0] > 0).save(file, **options)
 
@@ -110,11 +103,6 @@ def exr(file, photo):
 
     parts = {"RGB": np.ascontiguousarray(photo / 255, np.float32)}
     OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, parts).write(str(file))
-
-
-def radiance(file, photo):
-    rgbe = np.concatenate([photo, np.full((*photo.shape[:2], 1), 128, np.uint8)], axis=-1)
-    file.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 48 +X 64\n" + rgbe.tobytes())
 
 
 def same(photo: np.ndarray) -> np.ndarray:
@@ -147,7 +135,6 @@ KINDS: dict[str, tuple[str, Callable[..., None], Any]] = {
     "pgm of 10 bits": ("pgm", partial(pgm, largest=1023), grey),
     **{f"tif of {c}": ("tif", partial(save, compression=c), same) for c in ("tiff_lzw", "tiff_deflate", "packbits")},
     "tif of CMYK": ("tif", partial(save, mode="CMYK"), same),
-    "tif of LAB": ("tif", lab, same),
     "tif of 1 bit": ("tif", partial(bits, compression="group4"), one_bit),
     "tif of premultiplied RGBA": ("tif", partial(tiff, more=(1, 255)), same),
     "tif of RGBA": ("tif", partial(tiff, more=(2, 90)), same),
@@ -158,21 +145,15 @@ KINDS: dict[str, tuple[str, Callable[..., None], Any]] = {
     "tif of 16 bits": ("tif", partial(tiff, dtype="<u2", scale=257), same),
     "tif of 16 bits, big-endian": ("tif", partial(tiff, dtype=">u2", scale=257), same),
     "tif of 16-bit grey": ("tif", partial(tiff, dtype="<u2", scale=257, photometric=1), grey),
-    "tif of 16-bit grey, big-endian": ("tif", partial(tiff, dtype=">u2", scale=257, photometric=1), grey),
     "tif of 16-bit grey, white as 0": ("tif", partial(tiff, dtype="<u2", scale=257, photometric=0), grey),
     "tif of 16-bit RGBA": ("tif", partial(tiff, dtype="<u2", scale=257, more=(2, 30_000)), same),
     "tif of grey floats": ("tif", partial(tiff, dtype="<f4", scale=1 / 255, photometric=1), FLOATS),
-    "tif of grey floats, big-endian": ("tif", partial(tiff, dtype=">f4", scale=1 / 255, photometric=1), FLOATS),
     "tif of floats": ("tif", partial(tiff, dtype="<f4", scale=1 / 255), UNKNOWN),
-    "tif of half floats": ("tif", partial(tiff, dtype="<f2", scale=1 / 255), UNKNOWN),
-    "tif of doubles": ("tif", partial(tiff, dtype="<f8", scale=1 / 255, photometric=1), UNKNOWN),
-    "tif of signed bytes": ("tif", partial(tiff, dtype="<i1", scale=0.4, photometric=1), INTEGERS),
     "tif of signed 16 bits": ("tif", partial(tiff, dtype="<i2", scale=100, photometric=1), INTEGERS),
     "tif of 32 bits": ("tif", partial(tiff, dtype="<u4", scale=1e6, photometric=1), INTEGERS),
     "tif of signed 32 bits": ("tif", partial(tiff, dtype="<i4", scale=1e6, photometric=1), INTEGERS),
     "pfm": ("ppm", pfm, FLOATS),
     "OpenEXR as png": ("png", exr, UNKNOWN),
-    "Radiance as jpg": ("jpg", radiance, UNKNOWN),
     **{f"tif turned by tag {tag}": ("tif", partial(save, tiffinfo={274: tag}), same) for tag in range(1, 9)},
     "tif of LZW turned by tag 6": ("tif", partial(save, tiffinfo={274: 6}, compression="tiff_lzw"), same),
     **{f"{suffix} turned": (suffix, partial(save_rotated, orientation=6), same) for suffix in ("jpg", "png", "webp")},
