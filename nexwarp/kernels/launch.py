@@ -155,15 +155,14 @@ def _launch_again(
 def launch(
     kernel: wp.Kernel,
     dim: int | tuple[int, int],
-    inputs: Sequence[Any],
-    outputs: Sequence[Any],
+    arguments: Sequence[Any],
     *,
     device: wp.Device,
     stream: wp.Stream | None = None,
     block_dim: int = 256,
     sharing: Sharing = LIGHT,
 ) -> None:
-    """Launch a kernel, whose arguments are `first`, inputs and outputs, over the leading dimension of `dim`.
+    """Launch a kernel, whose arguments are `first` and these, over the leading dimension of `dim`.
 
     On CUDA, `block_dim` is the threads of a block and `stream` by default the device's current one.
     """
@@ -171,13 +170,13 @@ def launch(
     if min(shape) == 0:
         return
     if stream is not None:
-        _launch_again(kernel, shape, [0, *inputs, *outputs], stream, block_dim)
+        _launch_again(kernel, shape, [0, *arguments], stream, block_dim)
         return
 
     def part(bounds: tuple[int, int]) -> None:
         first, last = bounds
         here = (last - first, *shape[1:])
-        wp.launch(kernel, here, [first, *inputs], list(outputs), device=device, record_tape=False)
+        wp.launch(kernel, here, [first, *arguments], device=device, record_tape=False)
 
     most = EVEN_CHUNKS_A_THREAD * _threads if sharing.even else max(CHUNKS, CHUNKS_A_THREAD * _threads)
     split = chunks(shape[0], sharing.align, sharing.smallest, most)

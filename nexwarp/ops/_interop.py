@@ -20,6 +20,7 @@ Argument: TypeAlias = object
 
 REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
 STORAGES = {**REALS, torch.float16: wp.float16}
+WarpObject: TypeAlias = Any  # a struct, or the descriptor of an array, which Warp itself gives no types
 
 
 class Context(torch.autograd.function.FunctionCtx):
@@ -27,6 +28,10 @@ class Context(torch.autograd.function.FunctionCtx):
 
     saved_tensors: tuple[torch.Tensor, ...]
     needs_input_grad: tuple[bool, ...]
+    rest: Any  # what else the backward pass needs
+
+    def save_for_backward(self, *tensors: torch.Tensor | None) -> None:
+        """Keep tensors for the backward pass."""
 
 
 Backward = Callable[..., tuple[torch.Tensor | None, ...]]
@@ -65,6 +70,16 @@ def first_derivative(backward: Backward) -> Backward:
     return marked
 
 
+def needed(grads: Sequence[torch.Tensor | None], needs: Sequence[bool]) -> tuple[torch.Tensor | None, ...]:
+    """Gradients, None for those that are not needed."""
+    return tuple(x if need else None for x, need in zip(grads, needs, strict=True))
+
+
+def contiguous(*tensors: torch.Tensor | None) -> list[torch.Tensor | None]:
+    """The tensors, each contiguous; None stays None."""
+    return [None if x is None else x.contiguous() for x in tensors]
+
+
 def real_of(tensor: torch.Tensor) -> type:
     """Warp scalar type of a float32 or float64 tensor."""
     if tensor.dtype not in REALS:
@@ -79,7 +94,7 @@ def graph_is_kept() -> bool:
 
 
 # Descriptors by layout: copying one costs a quarter of making it anew, and a step makes hundreds.
-_layouts: dict[tuple[object, ...], Any] = {}
+_layouts: dict[tuple[object, ...], WarpObject] = {}
 _MOST_LAYOUTS = 4096
 
 
@@ -99,7 +114,7 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
         steps = (step for step, size in zip(tensor.stride(), tensor.shape, strict=True) if size > 1)
         if max(steps, default=0) * tensor.itemsize > LARGEST_INT:
             raise ValueError(f"expected a tensor with rows of at most {LARGEST_INT:,} bytes, got {tuple(tensor.shape)}")
-        owner: Any = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
+        owner: WarpObject = wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False, return_ctype=True)
         # Without what it keeps alive.
         layout = _layouts[key] = type(owner).from_buffer_copy(owner)
     view = type(layout).from_buffer_copy(layout)
@@ -109,18 +124,45 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
     return view
 
 
+# What a kernel or a struct declares: an array's elements, and the dimensions of a tensor that holds it; else None.
+Declared: TypeAlias = tuple[type, int] | None
+
+
+def _declared(kind: object) -> Declared:
+    return (kind.dtype, kind.ndim + len(getattr(kind.dtype, "_shape_", ()))) if isinstance(kind, wp.array) else None
+
+
+@functools.cache
+def _arguments_of(kernel: wp.Kernel) -> list[Declared]:
+    return [_declared(argument.type) for argument in kernel.adj.args[1:]]  # behind `first`
+
+
+@functools.cache
+def _fields_of(kind: WarpObject) -> dict[str, Declared]:
+    return {name: _declared(field.type) for name, field in kind.vars.items()}
+
+
+def _as_declared(value: Argument, declared: Declared) -> Argument:
+    """View a tensor as an array: dimensions in front of the array's own become one, or are added."""
+    if declared is None or not isinstance(value, torch.Tensor):
+        return value
+    dtype, own = declared
+    if value.ndim > own:
+        value = value.flatten(0, value.ndim - own)
+    return array(value[(None,) * (own - value.ndim)] if value.ndim < own else value, dtype)
+
+
 def _itself(value: Argument) -> Argument:
     return value
 
 
-def struct(kind: Any, **fields: Argument) -> Argument:
-    """Make a `wp.struct` argument of arrays, scalars and vectors; None is an array that is not there."""
+def struct(kind: WarpObject, **fields: Argument) -> Argument:
+    """Make a `wp.struct` argument of tensors, scalars and vectors; None is an array that is not there."""
     kind.ctype.__ctype__ = _itself  # how Warp asks its own instances
-    value = kind.ctype()
-    for name, field in fields.items():
-        if field is not None:
-            setattr(value, name, field)
-    value.fields = fields  # views of arrays keep their tensors alive
+    value, declared = kind.ctype(), _fields_of(kind)
+    value.fields = {name: _as_declared(field, declared[name]) for name, field in fields.items() if field is not None}
+    for name, field in value.fields.items():  # views of arrays, which keep their tensors alive
+        setattr(value, name, field)
     return value
 
 
@@ -219,9 +261,13 @@ def launch(
     block_dim: int = 256,
     sharing: launching.Sharing = launching.LIGHT,
 ) -> None:
-    """Launch on the device and current stream of `like`; see `nexwarp.kernels.launch.launch`."""
+    """Launch on the device and current stream of `like`; see `nexwarp.kernels.launch.launch`.
+
+    Tensors become arrays of the types that the kernel declares, see `_as_declared`.
+    """
+    arguments = [_as_declared(x, kind) for x, kind in zip((*inputs, *outputs), _arguments_of(kernel), strict=True)]
     device, stream = device_of(like), stream_of(like)
-    launching.launch(kernel, dim, inputs, outputs, device=device, stream=stream, block_dim=block_dim, sharing=sharing)
+    launching.launch(kernel, dim, arguments, device=device, stream=stream, block_dim=block_dim, sharing=sharing)
 
 
 def sums_in_fixed_point(like: torch.Tensor) -> bool:

@@ -5,7 +5,7 @@ import torch
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.activate import activate_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, first_derivative, launch, real_of, struct
+from nexwarp.ops._interop import Argument, Context, first_derivative, launch, needed, real_of, struct
 
 
 def activate(
@@ -43,15 +43,9 @@ def parameters(
     quats: torch.Tensor | None, scales: torch.Tensor, opacities: torch.Tensor, gammas: torch.Tensor
 ) -> Argument:
     """The struct `Parameters` of the kernels."""
-    real = real_of(scales)
-    t = types(real)
-    return struct(
-        t.Parameters,
-        quats=array(quats, t.vec4),
-        scales=array(scales.contiguous(), t.vec2),
-        opacities=array(opacities.contiguous(), real),
-        gammas=array(gammas.contiguous(), t.vec2),
-    )
+    scales, opacities, gammas = (x.contiguous() for x in (scales, opacities, gammas))
+    kind = types(real_of(scales)).Parameters
+    return struct(kind, quats=quats, scales=scales, opacities=opacities, gammas=gammas)
 
 
 class _Activate(torch.autograd.Function):
@@ -71,4 +65,4 @@ class _Activate(torch.autograd.Function):
         inputs = [parameters(*raw), parameters(grad_quats.contiguous(), *grads)]
         kernel = activate_kernels(real_of(raw[0])).backward
         launch(raw[0], kernel, len(raw[0]), inputs, [parameters(*grad_raw)])
-        return tuple(x if need else None for x, need in zip(grad_raw, ctx.needs_input_grad, strict=True))
+        return needed(grad_raw, ctx.needs_input_grad)

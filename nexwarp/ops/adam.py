@@ -4,12 +4,11 @@ import math
 from typing import NamedTuple
 
 import torch
-import warp as wp
 
 from nexwarp.kernels.adam import CPU_VALUES, VALUES, Adam
 from nexwarp.kernels.adam import adam_step as step_kernel
 from nexwarp.kernels.launch import Sharing
-from nexwarp.ops._interop import array, launch, struct
+from nexwarp.ops._interop import launch, struct
 
 SMALLEST_SHARE = 64  # threads of a chunk on a CPU, at least
 
@@ -63,20 +62,17 @@ def adam_step(
         if parameter.is_cuda:
             threads = -(-threads // 32) * 32  # whole warps, which add up what their lanes have
         losses = parameter.new_empty(threads // 32 if parameter.is_cuda else threads)
-    arrays = {
-        "values": parameter.view(-1),
-        "means": moments.mean.view(-1),
-        "squares": moments.square.view(-1),
-        "grads": None if grad is None else _aligned(grad).view(-1),
-        "factors": factors,
-        "step": moments.step.view(1),
-        "rates": rate.view(1),
-    }
     adam = struct(
         Adam,
-        **{name: array(x, wp.float32) for name, x in arrays.items()},
-        halves=array(None if half is None else half.view(-1), wp.float16),
+        values=parameter,
+        means=moments.mean,
+        squares=moments.square,
+        grads=None if grad is None else _aligned(grad),
+        halves=half,
+        factors=factors,
         level_bits=level_bits,
+        step=moments.step,
+        rates=rate,
         beta1=betas[0],
         beta2=betas[1],
         rest1=1.0 - betas[0],
@@ -85,7 +81,7 @@ def adam_step(
         log_beta2=math.log(betas[1]),
         epsilon=epsilon,
     )
-    launch(parameter, step_kernel, threads, [adam], [array(losses, wp.float32)], sharing=Sharing(SMALLEST_SHARE))
+    launch(parameter, step_kernel, threads, [adam], [losses], sharing=Sharing(SMALLEST_SHARE))
     return None if factors is None else losses.sum()
 
 

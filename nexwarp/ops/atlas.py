@@ -3,14 +3,12 @@
 from typing import NamedTuple
 
 import torch
-import warp as wp
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.atlas import atlas_types, blend_kernel, nearest_kernel
 from nexwarp.kernels.launch import Sharing
-from nexwarp.kernels.types import types
 from nexwarp.native.warp import tile_size_on
-from nexwarp.ops._interop import Argument, Context, array, first_derivative, launch, struct
+from nexwarp.ops._interop import Argument, Context, first_derivative, launch, struct
 from nexwarp.ops.collect import Walked
 from nexwarp.ops.project import Pinhole, Projection
 from nexwarp.ops.tiles import Tiles
@@ -57,14 +55,10 @@ def draw_atlas(
     return _Draw.apply(projection.records, texels.contiguous(), boxes, rects.contiguous(), scene, cards, cut)
 
 
-class _Context(Context):
-    rest: tuple[Walked, bool, Cut | None]
-
-
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: _Context,
+        ctx: Context,
         records: torch.Tensor,
         texels: torch.Tensor,
         boxes: torch.Tensor,
@@ -77,26 +71,27 @@ class _Draw(torch.autograd.Function):
         image, alphas, ids = records.new_empty(*size, 3), records.new_empty(size), None
         if cut is not None:
             ids = torch.empty(alphas.numel(), cut.layers, dtype=torch.int32, device=records.device)
-        atlas, drawn = _atlas(real, texels, boxes, rects, cut), _drawn(real, image, alphas, ids)
+        kinds, atlas = atlas_types(real), _atlas(real, texels, boxes, rects, cut)
+        drawn = struct(kinds.Drawn, image=image, alphas=alphas, ids=ids)
         if cut is not None:
             scene.launch(nearest_kernel(real, cut.layers), [atlas, drawn])
-        unused = struct(atlas_types(real).Sums)
-        scene.launch(blend_kernel(real, cards, cut is not None, False), [atlas, drawn, drawn, unused])
-        ctx.save_for_backward(texels, boxes, rects, ids, image, alphas)  # type: ignore[arg-type]  # torch takes None, too
+        scene.launch(blend_kernel(real, cards, cut is not None, False), [atlas, drawn, drawn, struct(kinds.Sums)])
+        ctx.save_for_backward(texels, boxes, rects, ids, image, alphas)
         ctx.rest = (scene, cards, cut)
         return image, alphas
 
     @staticmethod
     @first_derivative
-    def backward(ctx: _Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         scene, cards, cut = ctx.rest
         texels, boxes, rects, ids, image, alphas = ctx.saved_tensors
-        real, records = scene.real, scene.records
-        t = types(real)
+        real, records, kinds = scene.real, scene.records, atlas_types(scene.real)
         grad_texels, grad_colors = torch.zeros_like(texels), records.new_zeros(len(records), 4)
-        sums = struct(atlas_types(real).Sums, texels=array(grad_texels, t.vec4), colors=array(grad_colors, t.vec4))
-        drawn = (_drawn(real, image, alphas, ids), _drawn(real, *(x.contiguous() for x in grads)))
-        arguments = [*scene.arguments(), _atlas(real, texels, boxes, rects, cut), *drawn]
+        sums = struct(kinds.Sums, texels=grad_texels, colors=grad_colors)
+        grad_image, grad_alphas = (x.contiguous() for x in grads)
+        drawn = struct(kinds.Drawn, image=image, alphas=alphas, ids=ids)
+        incoming = struct(kinds.Drawn, image=grad_image, alphas=grad_alphas)
+        arguments = [*scene.arguments(), _atlas(real, texels, boxes, rects, cut), drawn, incoming]
         threads = (len(scene.tiles.tile_offsets) - 1) * tile_size_on(records.is_cuda) ** 2
         alone = Sharing(smallest=max(threads, 1))  # neighbouring tiles add to the same texels, on a CPU without atomics
         launch(records, blend_kernel(real, cards, cut is not None, True), threads, arguments, [sums], sharing=alone)
@@ -107,13 +102,6 @@ class _Draw(torch.autograd.Function):
 
 def _atlas(real: type, texels: torch.Tensor, boxes: torch.Tensor, rects: torch.Tensor, cut: Cut | None) -> Argument:
     """The struct `Atlas` of the kernels."""
-    vec4 = types(real).vec4
-    arrays = {name: array(x, vec4) for name, x in (("texels", texels), ("boxes", boxes), ("rects", rects))}
     cutoff, steepness = (0.0, 0.0) if cut is None else cut[:2]
-    return struct(atlas_types(real).Atlas, **arrays, cutoff=cutoff, steepness=steepness)
-
-
-def _drawn(real: type, image: torch.Tensor, alphas: torch.Tensor, ids: torch.Tensor | None = None) -> Argument:
-    """The struct `Drawn` of the kernels."""
-    pixels = {"image": array(image.view(-1, 3), types(real).vec3), "alphas": array(alphas.view(-1), real)}
-    return struct(atlas_types(real).Drawn, **pixels, ids=array(ids, wp.int32))
+    kind = atlas_types(real).Atlas
+    return struct(kind, texels=texels, boxes=boxes, rects=rects, cutoff=cutoff, steepness=steepness)

@@ -16,7 +16,7 @@ from nexwarp.native.warp import tile_size_on
 from nexwarp.ops._interop import (
     Argument,
     Context,
-    array,
+    contiguous,
     first_derivative,
     from_fixed_point,
     launch,
@@ -92,11 +92,12 @@ def collect(
     request = SplatErrorRequest()
     if channels is not None:
         check_tensors({"records": (projection.records, ("N", 4, 4)), "channels": (channels, ("N", CHANNELS))})
-        channels = channels.contiguous()
+        channels = channels.contiguous().view(-1, 4, 4)
     stored = None if channels is None else channels.detach()
     scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera, stored)
     outputs = _Collect.apply(projection.records, channels, scene, max_hits, request)
     plain, base, ids, depths, weights, alpha, stops, more = outputs
+    more = None if more is None else more.flatten(2)
     return Hits(plain, base, ids, depths, weights, alpha, stops, request, more)
 
 
@@ -119,9 +120,8 @@ def splat_error(
     scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera)
     buffers = (hits.plain, hits.base, hits.ids, hits.depths, hits.weights, hits.alpha, hits.stops)
     outputs = tuple(x.detach() for x in buffers)
-    plain, base, _ids, depths, weights, alpha, _stops = (torch.zeros_like(x) for x in outputs)
     errors = errors.detach().to(scene.records.dtype).contiguous()
-    _, sums, _ = _backward(scene, (*outputs, None), (plain, base, depths, weights, alpha, None), errors)
+    _, sums, _ = _backward(scene, (*outputs, None), (*map(torch.zeros_like, outputs), None), errors)
     assert sums is not None
     return sums
 
@@ -129,7 +129,7 @@ def splat_error(
 class Walked(NamedTuple):
     """What a walk along rays reads: records (N, 4, 4) and limits (N,) of the surfels, their lists, the image plane.
 
-    `channels` (N, 16) are more channels of their colours, or None.
+    `channels` (N, 4, 4) are more channels of their colours, or None.
     """
 
     records: torch.Tensor
@@ -146,32 +146,20 @@ class Walked(NamedTuple):
     def arguments(self) -> list[Argument]:
         """The structs `Surfels`, `TileLists` and `View` of the kernels."""
         t, tiles, camera = types(self.real), self.tiles, self.camera
-        records, limits, reaches = array(self.records, t.vec4), array(self.limits, t.real), array(tiles.reaches, t.vec2)
-        lists = {name: array(getattr(tiles, name), wp.int32) for name in TileLists.vars}  # type: ignore[attr-defined]  # of a Warp struct
-        return [
-            struct(t.Surfels, records=records, limits=limits, reaches=reaches, channels=rows_of(self.channels)),
-            struct(TileLists, **lists),
-            view_of(camera, t.real, tiles.columns),
-        ]
+        surfels = {"records": self.records, "limits": self.limits, "reaches": tiles.reaches, "channels": self.channels}
+        lists = {name: getattr(tiles, name) for name in TileLists.vars}  # type: ignore[attr-defined]  # of a Warp struct
+        size = wp.vec2i(camera.width, camera.height)
+        view = struct(t.View, Ks=camera.K.contiguous(), size=size, tile_columns=tiles.columns, near=camera.near)
+        return [struct(t.Surfels, **surfels), struct(TileLists, **lists), view]
 
     def launch(self, kernel: wp.Kernel, arguments: list[Argument]) -> None:
         """Launch a kernel over the pixels of all tiles, with these arguments behind those of `arguments`."""
-        launch_pixels(self.records, kernel, len(self.tiles.tile_offsets) - 1, [*self.arguments(), *arguments])
-
-
-def view_of(camera: Pinhole, real: type, columns: int) -> Argument:
-    """The image plane as the kernels read it; `columns` tiles in a row."""
-    t = types(real)
-    K, size = array(camera.K.contiguous()[None], t.mat33), wp.vec2i(camera.width, camera.height)
-    return struct(t.View, Ks=K, size=size, tile_columns=columns, near=camera.near)
-
-
-def launch_pixels(like: torch.Tensor, kernel: wp.Kernel, tiles: int, arguments: list[Argument]) -> None:
-    """Launch a kernel over the pixels of a number of tiles."""
-    pixels = tile_size_on(like.is_cuda) ** 2
-    # All pixels of a tile write to its entries, so one CPU thread must walk them all.
-    sharing = Sharing(smallest=pixels, align=pixels, even=False)
-    launch(like, kernel, tiles * pixels, arguments, [], block_dim=BLOCK_DIM, sharing=sharing)
+        pixels = tile_size_on(self.records.is_cuda) ** 2  # of a tile
+        threads = pixels * (len(self.tiles.tile_offsets) - 1)
+        # All pixels of a tile write to its entries, so one CPU thread must walk them all.
+        sharing = Sharing(smallest=pixels, align=pixels, even=False)
+        everything = [*self.arguments(), *arguments]
+        launch(self.records, kernel, threads, everything, [], block_dim=BLOCK_DIM, sharing=sharing)
 
 
 class SlotSums:
@@ -195,29 +183,18 @@ class SlotSums:
 
     def argument(self) -> Argument:
         """The struct `Sums` of the kernels."""
-        real = real_of(self.like)
-        sums = (self.records, self.channels, self.errors)
-        if self.fixed_point:
-            pairs = (None if x is None else x.view(len(x), -1) for x in sums)
-            records, channels, errors = (array(x, wp.int64) for x in pairs)
-        else:
-            dtypes = (types(real).vec4, types(real).vec4, real)
-            records, channels, errors = (array(x, dtype) for x, dtype in zip(sums, dtypes, strict=True))
-        return struct(
-            gradient_types(real, self.fixed_point).Sums,
-            slots=array(self.tiles.entries if self.exact else None, wp.int32),
-            records=records,
-            errors=errors,
-            bad=array(self.bad, wp.int32),
-            channels=channels,
-        )
+        sums = {"records": self.records, "errors": self.errors, "channels": self.channels}
+        if self.fixed_point:  # pairs of a surfel, one behind the other
+            sums = {name: None if x is None else x.flatten(1) for name, x in sums.items()}
+        kind = gradient_types(real_of(self.like), self.fixed_point).Sums
+        return struct(kind, **sums, slots=self.tiles.entries if self.exact else None, bad=self.bad)
 
     def totals(self) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-        """Sums of the records' gradients (N, 4, 4) and, where asked for, of errors (N,) and channels' (N, 16)."""
+        """Sums of the records' gradients (N, 4, 4) and, where asked for, of errors (N,) and channels' (N, 4, 4)."""
         real = real_of(self.like)
         records = self._reduced(self.records, types(real).vec4)
         errors = None if self.errors is None else self._reduced(self.errors[:, None], real)[:, 0]
-        channels = None if self.channels is None else self._reduced(self.channels, types(real).vec4).flatten(1)
+        channels = None if self.channels is None else self._reduced(self.channels, types(real).vec4)
         return records, errors, channels
 
     def _reduced(self, slots: torch.Tensor, dtype: type) -> torch.Tensor:
@@ -227,20 +204,15 @@ class SlotSums:
         if not self.exact:
             return slots
         sums = slots.new_zeros(len(self.like), *slots.shape[1:])
-        order, ends = (array(x, wp.int32) for x in (self.tiles.order, self.tiles.ends))
-        inputs = [order, ends, array(slots, dtype), slots.shape[1]]
-        launch(slots, reduce_slots_kernel(dtype), len(self.like), inputs, [array(sums, dtype)])
+        inputs = [self.tiles.order, self.tiles.ends, slots, slots.shape[1]]
+        launch(slots, reduce_slots_kernel(dtype), len(self.like), inputs, [sums])
         return sums
-
-
-class _Context(Context):
-    rest: tuple[Walked, SplatErrorRequest]
 
 
 class _Collect(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: _Context,
+        ctx: Context,
         records: torch.Tensor,
         channels: torch.Tensor | None,
         scene: Walked,
@@ -253,21 +225,19 @@ class _Collect(torch.autograd.Function):
         depths, weights = (records.new_empty(*shape, max_hits) for _ in range(2))
         alphas = records.new_empty(shape)
         stops = torch.empty(shape, dtype=torch.int32, device=records.device)
-        more = None if channels is None else records.new_empty(*shape, CHANNELS)
+        more = None if channels is None else records.new_empty(*shape, 4, 4)
         outputs = (plain, base, ids, depths, weights, alphas, stops, more)
-        scene.launch(collect_kernel(scene.real, max_hits, more is not None), [hits_argument(scene.real, outputs)])
-        ctx.save_for_backward(*outputs)  # type: ignore[arg-type]  # torch takes None, too
+        scene.launch(collect_kernel(scene.real, max_hits, more is not None), [_hits(scene.real, outputs)])
+        ctx.save_for_backward(*outputs)
         ctx.rest = (scene, request)
         ctx.mark_non_differentiable(ids, stops)
         return outputs
 
     @staticmethod
     @first_derivative
-    def backward(ctx: _Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         scene, request = ctx.rest
-        plain, base, _ids, depths, weights, alphas, _stops, more = grads
-        incoming = (plain, base, depths, weights, alphas, more)
-        grad_records, errors, grad_channels = _backward(scene, ctx.saved_tensors, incoming, request.errors)
+        grad_records, errors, grad_channels = _backward(scene, ctx.saved_tensors, grads, request.errors)
         if errors is not None:
             request.sums_after_backward = errors
         return grad_records, grad_channels, None, None, None
@@ -280,50 +250,18 @@ def _backward(
     errors: torch.Tensor | None,
 ) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
     """Gradients of the records (N, 4, 4), sums of weight * error (N,) where there are errors, and of channels."""
-    real = scene.real
-    t = types(real)
-    plain, base, depths, weights, alphas, more = (None if x is None else x.contiguous() for x in grads)
-    assert plain is not None and base is not None and depths is not None and weights is not None and alphas is not None
-    max_hits, wide = depths.shape[-1], more is not None
-    sums = SlotSums(scene.records, scene.tiles, with_errors=errors is not None, with_channels=wide)
-    incoming = struct(
-        gradient_types(real).HitGradients,
-        plain=array(plain.view(-1, 3), t.vec3),
-        base=array(base.view(-1, 3), t.vec3),
-        depths=_buffer_array(depths, real),
-        weights=_buffer_array(weights, real),
-        alphas=array(alphas.view(-1), real),
-        errors=array(None if errors is None else errors.view(-1), real),
-        channels=rows_of(more),
-    )
-    kernel = collect_backward_kernel(real, max_hits, errors is not None, sums.fixed_point, scene.tiles.exact, wide)
-    scene.launch(kernel, [hits_argument(real, outputs), incoming, sums.argument()])
+    plain, base, _ids, depths, weights, alphas, _stops, channels = contiguous(*grads)
+    assert depths is not None
+    max_hits, with_errors, wide = depths.shape[-1], errors is not None, channels is not None
+    sums = SlotSums(scene.records, scene.tiles, with_errors=with_errors, with_channels=wide)
+    images = {"plain": plain, "base": base, "depths": depths, "weights": weights, "alphas": alphas}
+    incoming = struct(gradient_types(scene.real).HitGradients, **images, errors=errors, channels=channels)
+    kernel = collect_backward_kernel(scene.real, max_hits, with_errors, sums.fixed_point, scene.tiles.exact, wide)
+    scene.launch(kernel, [_hits(scene.real, outputs), incoming, sums.argument()])
     return sums.totals()
 
 
-def hits_argument(real: type, outputs: tuple[torch.Tensor | None, ...]) -> Argument:
-    """The struct `Hits` of the kernels, of (plain, base, ids, depths, weights, alphas, stops, channels)."""
-    t = types(real)
-    *buffers, stops, channels = outputs
-    plain, base, ids, depths, weights, alphas = (x for x in buffers if x is not None)
-    return struct(
-        t.Hits,
-        plain=array(plain.view(-1, 3), t.vec3),
-        base=array(base.view(-1, 3), t.vec3),
-        ids=_buffer_array(ids, wp.int32),
-        depths=_buffer_array(depths, real),
-        weights=_buffer_array(weights, real),
-        alphas=array(alphas.view(-1), real),
-        stops=array(None if stops is None else stops.view(-1), wp.int32),
-        channels=rows_of(channels),
-    )
-
-
-def rows_of(channels: torch.Tensor | None) -> Argument:
-    """View channels (..., 16) as the kernels do, in four rows of four."""
-    return None if channels is None else array(channels.view(-1, 4, 4), types(real_of(channels)).vec4)
-
-
-def _buffer_array(buffer: torch.Tensor, dtype: type) -> Argument:
-    """View a K-buffer (H, W, K) as the kernels do, (H * W, K); K = 0 gives one unused element."""
-    return array(buffer.view(-1, buffer.shape[-1]) if buffer.shape[-1] else buffer.new_empty(1, 1), dtype)
+def _hits(real: type, outputs: tuple[torch.Tensor | None, ...]) -> Argument:
+    """The struct `Hits` of the kernels; outputs have the order of its fields."""
+    kind = types(real).Hits
+    return struct(kind, **dict(zip(kind.vars, outputs, strict=True)))

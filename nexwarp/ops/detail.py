@@ -1,11 +1,10 @@
 """Limits of detail: surfels and depths of texture look-ups for cameras that are not where training views were."""
 
 import torch
-import warp as wp
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.detail import antialias_kernels, limit_depths_kernel
-from nexwarp.ops._interop import Context, array, first_derivative, launch, real_of
+from nexwarp.ops._interop import Context, first_derivative, launch, needed, real_of
 from nexwarp.ops.activate import parameters
 
 
@@ -54,10 +53,10 @@ class _Antialias(torch.autograd.Function):
     def forward(
         ctx: Context, farthest: torch.Tensor, focal: torch.Tensor, depths: torch.Tensor, *shape: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        real = real_of(farthest)
         blurred = tuple(torch.empty_like(x) for x in shape)
-        inputs = [array(depths, real), parameters(None, *shape), array(farthest, real), array(focal, real)]
-        launch(farthest, antialias_kernels(real).forward, len(farthest), inputs, [parameters(None, *blurred)])
+        inputs = [depths, parameters(None, *shape), farthest, focal]
+        kernel = antialias_kernels(real_of(farthest)).forward
+        launch(farthest, kernel, len(farthest), inputs, [parameters(None, *blurred)])
         ctx.save_for_backward(farthest, focal, depths, *shape)
         return blurred
 
@@ -65,14 +64,11 @@ class _Antialias(torch.autograd.Function):
     @first_derivative
     def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         farthest, focal, depths, *shape = ctx.saved_tensors
-        real = real_of(farthest)
         grad_depths, *grad_shape = (torch.empty_like(x) for x in (depths, *shape))
-        inputs = [array(depths, real), parameters(None, *shape), array(farthest, real), array(focal, real)]
-        outputs = [array(grad_depths, real), parameters(None, *grad_shape)]
-        kernel = antialias_kernels(real).backward
-        launch(farthest, kernel, len(farthest), [*inputs, parameters(None, *grads)], outputs)
-        needed = zip((grad_depths, *grad_shape), ctx.needs_input_grad[2:], strict=True)
-        return (None, None, *(x if need else None for x, need in needed))
+        inputs = [depths, parameters(None, *shape), farthest, focal, parameters(None, *grads)]
+        kernel = antialias_kernels(real_of(farthest)).backward
+        launch(farthest, kernel, len(farthest), inputs, [grad_depths, parameters(None, *grad_shape)])
+        return needed((None, None, grad_depths, *grad_shape), ctx.needs_input_grad)
 
 
 def limit_depths(
@@ -98,10 +94,9 @@ def limit_depths(
 class _LimitDepths(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Context, ids: torch.Tensor, depths: torch.Tensor, *limits: torch.Tensor) -> torch.Tensor:
-        real = real_of(depths)
         limited = torch.empty_like(depths)
-        inputs = [array(ids.view(-1), wp.int32), *(array(x, real) for x in (depths.view(-1), *limits))]
-        launch(depths, limit_depths_kernel(real), depths.numel(), inputs, [array(limited.view(-1), real)])
+        kernel = limit_depths_kernel(real_of(depths))
+        launch(depths, kernel, depths.numel(), [ids, depths, *limits], [limited])
         ctx.save_for_backward(depths, limited)
         return limited
 

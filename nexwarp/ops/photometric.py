@@ -1,14 +1,13 @@
 """What compares an image with a photo pixel by pixel: several losses in one go, and the photo's exposure."""
 
 import math
-from collections.abc import Sequence
 
 import torch
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.photometric import expose_kernels, photometric_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, first_derivative, launch, real_of
+from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, real_of
 
 Factors = tuple[float, float, float]
 
@@ -60,48 +59,34 @@ def photometric_terms(
     return _Photometric.apply((l1, texture, alpha), math.inf if saturation is None else saturation, *tensors)
 
 
-def _arrays(real: type, tensors: Sequence[torch.Tensor | None]) -> list[Argument]:
-    """View image, textured, weights and any more images, (H, W, ...) each, as arrays of pixels."""
-    flat = [None if x is None else x.view(x.shape[0] * x.shape[1], x.shape[2]) for x in tensors]
-    return [array(x, real if i == 2 else types(real).vec3) for i, x in enumerate(flat)]
-
-
-class _Context(Context):
-    scales: tuple[float, float, float]
-    saturation: float
-
-
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: _Context, factors: Factors, saturation: float, *tensors: torch.Tensor | None
+        ctx: Context, factors: Factors, saturation: float, *tensors: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:
         like = next(x for x in tensors if x is not None)
         real, pixels = real_of(like), like.shape[0] * like.shape[1]
-        ctx.scales = (factors[0] / (3 * pixels), factors[1] / (3 * pixels), factors[2] / pixels)
-        ctx.saturation = saturation
+        scales = types(real).vec3(factors[0] / (3 * pixels), factors[1] / (3 * pixels), factors[2] / pixels)
         maps = like.new_empty(sum(factor != 0.0 for factor in factors), pixels)
         rows = iter(maps)
-        outputs = [array(next(rows), real) if factor else None for factor in factors]
-        inputs = [*_arrays(real, tensors), types(real).vec3(*ctx.scales), real(saturation)]
-        launch(like, photometric_kernels(real).forward, pixels, inputs, outputs)
-        ctx.save_for_backward(*tensors)  # type: ignore[arg-type]  # torch saves None too
+        outputs = [next(rows) if factor else None for factor in factors]
+        launch(like, photometric_kernels(real).forward, pixels, [*tensors, scales, saturation], outputs)
+        ctx.save_for_backward(*tensors)
+        ctx.rest = scales, saturation
         ctx.set_materialize_grads(False)
         sums = iter(maps.sum(1).unbind())
         return tuple(next(sums) if factor else None for factor in factors)
 
     @staticmethod
     @first_derivative
-    def backward(ctx: _Context, *grads: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Context, *grads: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         tensors = ctx.saved_tensors
         like = next(x for x in tensors if x is not None)
-        real, pixels = real_of(like), like.shape[0] * like.shape[1]
         l1, texture, alpha = (grad is not None for grad in grads)
         reached = zip(tensors, ctx.needs_input_grad[2:], (l1, texture, texture or alpha, False), strict=True)
         results = [torch.empty_like(x) if needed and term else None for x, needed, term in reached]
-        incoming = [None if grad is None else array(grad.reshape(1), real) for grad in grads]
-        inputs = [*_arrays(real, tensors), types(real).vec3(*ctx.scales), real(ctx.saturation), *incoming]
-        launch(like, photometric_kernels(real).backward, pixels, inputs, _arrays(real, results[:3]))
+        kernel = photometric_kernels(real_of(like)).backward
+        launch(like, kernel, like.shape[0] * like.shape[1], [*tensors, *ctx.rest, *grads], results[:3])
         return None, None, *results
 
 
@@ -132,38 +117,33 @@ def expose(
     return _Expose.apply(*(x.contiguous() for x in (image, textured, exposure, photo)), saturation)
 
 
-def _images(real: type, *images: torch.Tensor | None) -> list[Argument]:
-    return [array(None if x is None else x.view(-1, 3), types(real).vec3) for x in images]
-
-
 class _Expose(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: _Context,
+        ctx: Context,
         image: torch.Tensor,
         textured: torch.Tensor,
         exposure: torch.Tensor,
         photo: torch.Tensor,
         saturation: float,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        real = real_of(image)
         exposed, exposed_colors = torch.empty_like(image), torch.empty_like(textured)
-        inputs = [*_images(real, image, textured, exposure, photo), saturation]
-        launch(image, expose_kernels(real).forward, photo.numel() // 3, inputs, _images(real, exposed, exposed_colors))
+        inputs = [image, textured, exposure, photo, saturation]
+        kernel = expose_kernels(real_of(image)).forward
+        launch(image, kernel, photo.numel() // 3, inputs, [exposed, exposed_colors])
         ctx.save_for_backward(image, exposure, photo)
-        ctx.saturation = saturation
+        ctx.rest = saturation
         ctx.set_materialize_grads(False)
         return exposed, exposed_colors
 
     @staticmethod
     @first_derivative
     def backward(
-        ctx: _Context, grad_exposed: torch.Tensor | None, grad_exposed_colors: torch.Tensor | None
+        ctx: Context, grad_exposed: torch.Tensor | None, grad_exposed_colors: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:
         image, exposure, photo = ctx.saved_tensors
-        real = real_of(image)
-        grads = [None if x is None else x.contiguous() for x in (grad_exposed, grad_exposed_colors)]
+        grads = contiguous(grad_exposed, grad_exposed_colors)
         results = [None if x is None else torch.empty_like(x) for x in grads]
-        inputs = [*_images(real, image, exposure, photo), ctx.saturation, *_images(real, *grads)]
-        launch(image, expose_kernels(real).backward, photo.numel() // 3, inputs, _images(real, *results))
+        inputs = [image, exposure, photo, ctx.rest, *grads]
+        launch(image, expose_kernels(real_of(image)).backward, photo.numel() // 3, inputs, results)
         return *results, None, None, None

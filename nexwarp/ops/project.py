@@ -6,8 +6,7 @@ import torch
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.project import project_kernels
-from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, first_derivative, launch, real_of
+from nexwarp.ops._interop import Context, first_derivative, launch, needed, real_of
 
 
 @dataclass(frozen=True)
@@ -79,29 +78,14 @@ def project(
     return Projection(*_Project.apply(*(x.contiguous() for x in tensors)))
 
 
-def _arrays(real: type, tensors: tuple[torch.Tensor | None, ...]) -> list[Argument]:
-    t = types(real)
-    dtypes = (t.vec3, t.vec4, t.vec2, real, t.vec2, t.vec3, t.mat44)
-    return [array(x, dtype) for x, dtype in zip(tensors, dtypes, strict=True)]
-
-
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Context, *inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
         means = inputs[0]
-        real = real_of(means)
-        t = types(real)
         records = means.new_empty(len(means), 4, 4)
         centers = torch.empty_like(means)
         limits = means.new_empty(len(means))
-        outputs = [array(records, t.vec4), array(centers, t.vec3), array(limits, real)]
-        launch(
-            means,
-            project_kernels(real).forward,
-            len(means),
-            _arrays(real, (*inputs[:6], inputs[6][None])),
-            outputs,
-        )
+        launch(means, project_kernels(real_of(means)).forward, len(means), inputs, [records, centers, limits])
         ctx.save_for_backward(*inputs[:3], inputs[6])
         ctx.mark_non_differentiable(centers, limits)
         ctx.set_materialize_grads(False)
@@ -115,14 +99,12 @@ class _Project(torch.autograd.Function):
         if grad_records is None:
             return (None,) * 7
         means, quats, scales, viewmat = ctx.saved_tensors
-        real, count = real_of(means), len(means)
-        t = types(real)
+        count = len(means)
         grads = [torch.empty_like(x) for x in (means, quats, scales)]
         grads += [means.new_empty(count), torch.empty_like(scales), torch.empty_like(means)]
         # A slot a surfel, then one sum: no contention, and a fixed order.
         grad_viewmats = viewmat.new_empty(count, 4, 4) if ctx.needs_input_grad[6] else None
-        inputs = [array(x, dtype) for x, dtype in zip((means, quats, scales), (t.vec3, t.vec4, t.vec2), strict=True)]
-        inputs += [array(viewmat[None], t.mat44), array(grad_records.contiguous(), t.vec4)]
-        launch(means, project_kernels(real).backward, count, inputs, _arrays(real, (*grads, grad_viewmats)))
-        wanted = [x if need else None for x, need in zip(grads, ctx.needs_input_grad, strict=False)]
-        return (*wanted, None if grad_viewmats is None else grad_viewmats.sum(0))
+        inputs = [means, quats, scales, viewmat, grad_records.contiguous()]
+        launch(means, project_kernels(real_of(means)).backward, count, inputs, [*grads, grad_viewmats])
+        grad_viewmat = None if grad_viewmats is None else grad_viewmats.sum(0)
+        return needed([*grads, grad_viewmat], ctx.needs_input_grad)

@@ -1,11 +1,10 @@
 """Structural dissimilarity of two images: on a GPU, in float32, a kernel each way; elsewhere torch."""
 
 import torch
-import warp as wp
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.ssim import C1, C2, REACH, THREADS, WINDOW_SIZE, blocks_of, gradient_kernel, score_kernel, tap
-from nexwarp.ops._interop import Context, array, first_derivative, launch, real_of
+from nexwarp.ops._interop import Context, first_derivative, launch, real_of
 
 
 def weighted_dssim(image: torch.Tensor, target: torch.Tensor, factor: float = 1.0) -> torch.Tensor:
@@ -54,33 +53,26 @@ def _blur(maps: torch.Tensor) -> torch.Tensor:
     return across[0].permute(1, 2, 0)
 
 
-class _Context(Context):
-    scale: float
-
-
 class _KernelDSSIM(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: _Context, image: torch.Tensor, target: torch.Tensor, factor: float) -> torch.Tensor:
+    def forward(ctx: Context, image: torch.Tensor, target: torch.Tensor, factor: float) -> torch.Tensor:
         derivatives = image.new_empty(3, image.numel()) if ctx.needs_input_grad[0] else None
-        ctx.scale = factor / image.numel()
+        ctx.rest = factor / image.numel()
         if derivatives is not None:
             ctx.save_for_backward(image, target, derivatives)
         height, width = image.shape[0], 3 * image.shape[1]
         threads = THREADS * blocks_of(height, width)
         losses = image.new_empty(threads)
-        inputs = [*(array(x.view(-1), wp.float32) for x in (image, target)), height, width, ctx.scale]
-        outputs = [array(losses, wp.float32), array(derivatives, wp.float32)]
-        launch(image, score_kernel(), threads, inputs, outputs, block_dim=THREADS)
+        inputs = [image, target, height, width, ctx.rest]
+        launch(image, score_kernel(), threads, inputs, [losses, derivatives], block_dim=THREADS)
         return losses.sum()
 
     @staticmethod
     @first_derivative
-    def backward(ctx: _Context, grad_loss: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+    def backward(ctx: Context, grad_loss: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         image, target, derivatives = ctx.saved_tensors
         height, width = image.shape[0], 3 * image.shape[1]
         grad_image = torch.empty_like(image)
-        inputs = [array(derivatives, wp.float32), *(array(x.view(-1), wp.float32) for x in (image, target))]
-        inputs += [height, width, ctx.scale, array(grad_loss.reshape(1), wp.float32)]
-        outputs = [array(grad_image.view(-1), wp.float32)]
-        launch(image, gradient_kernel(), THREADS * blocks_of(height, width), inputs, outputs, block_dim=THREADS)
+        inputs = [derivatives, image, target, height, width, ctx.rest, grad_loss]
+        launch(image, gradient_kernel(), THREADS * blocks_of(height, width), inputs, [grad_image], block_dim=THREADS)
         return grad_image, None, None

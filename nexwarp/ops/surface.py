@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import torch
-import warp as wp
 
 from nexwarp.kernels.surface import surface_kernel
 from nexwarp.kernels.surface_backward import surface_backward_kernel
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, array, first_derivative, struct
+from nexwarp.ops._interop import Context, first_derivative, struct
 from nexwarp.ops.collect import Hits, SlotSums, Walked
 from nexwarp.ops.project import Pinhole, Projection
 from nexwarp.ops.tiles import Tiles
@@ -71,13 +70,9 @@ def walk_surface(records: torch.Tensor, scene: Walked, stops: torch.Tensor) -> t
     return _Surface.apply(records, scene, stops)
 
 
-class _Context(Context):
-    scene: Walked
-
-
 class _Surface(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: _Context, records: torch.Tensor, scene: Walked, stops: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    def forward(ctx: Context, records: torch.Tensor, scene: Walked, stops: torch.Tensor) -> tuple[torch.Tensor, ...]:
         shape = (scene.camera.height, scene.camera.width)
         expected, median, top = (records.new_empty(shape) for _ in range(3))
         normals = records.new_empty(*shape, 3)
@@ -86,43 +81,21 @@ class _Surface(torch.autograd.Function):
             totals = records.new_empty(shape)
             picks = torch.empty(*shape, 2, dtype=torch.int32, device=records.device)
             ctx.save_for_backward(stops, expected, normals, totals, picks)
-            ctx.scene = scene
-        outputs = surface_argument(scene.real, (expected, median, top, normals), totals, picks)
-        scene.launch(surface_kernel(scene.real), [array(stops.view(-1), wp.int32), outputs])
+            ctx.rest = scene
+        written = {"expected": expected, "median": median, "top": top, "normals": normals}
+        outputs = struct(types(scene.real).Surface, **written, totals=totals, picks=picks)
+        scene.launch(surface_kernel(scene.real), [stops, outputs])
         return expected, median, top, normals
 
     @staticmethod
     @first_derivative
-    def backward(ctx: _Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         stops, expected, normals, totals, picks = ctx.saved_tensors
-        scene = ctx.scene
-        sums = SlotSums(scene.records, scene.tiles)
-        outputs = surface_argument(scene.real, (expected, None, None, normals), totals, picks)
-        incoming = surface_argument(scene.real, tuple(x.contiguous() for x in grads))
-        arguments = [array(stops.view(-1), wp.int32), outputs, incoming, sums.argument()]
-        scene.launch(surface_backward_kernel(scene.real, sums.fixed_point, scene.tiles.exact), arguments)
+        scene: Walked = ctx.rest
+        sums, kind = SlotSums(scene.records, scene.tiles), types(scene.real).Surface
+        outputs = struct(kind, expected=expected, normals=normals, totals=totals, picks=picks)
+        expected, median, top, normals = (x.contiguous() for x in grads)
+        incoming = struct(kind, expected=expected, median=median, top=top, normals=normals)
+        kernel = surface_backward_kernel(scene.real, sums.fixed_point, scene.tiles.exact)
+        scene.launch(kernel, [stops, outputs, incoming, sums.argument()])
         return sums.totals()[0], None, None
-
-
-def surface_argument(
-    real: type,
-    images: tuple[torch.Tensor | None, ...],
-    totals: torch.Tensor | None = None,
-    picks: torch.Tensor | None = None,
-) -> Argument:
-    """The struct `Surface` of the kernels, of (expected, median, top, normals)."""
-    t = types(real)
-
-    def flat(image: torch.Tensor | None, dtype: type) -> Argument:
-        return array(None if image is None else image.view(-1, *image.shape[2:]), dtype)
-
-    expected, median, top, normals = images
-    return struct(
-        t.Surface,
-        expected=flat(expected, real),
-        median=flat(median, real),
-        top=flat(top, real),
-        normals=flat(normals, t.vec3),
-        totals=flat(totals, real),
-        picks=flat(picks, wp.vec2i),
-    )

@@ -22,7 +22,7 @@ from torch.autograd.function import once_differentiable
 from nexwarp import ops
 from nexwarp.kernels.mlp import POINTS, THREADS, layer_kernel
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Context, array, launch, real_of
+from nexwarp.ops._interop import Context, launch
 from nexwarp.ops.collect import Walked
 from nexwarp.ops.neural_field import Points, Rays
 from nexwarp.ops.project import Pinhole, Projection
@@ -275,9 +275,9 @@ class _Colors(torch.autograd.Function):
         count = coefficients.shape[1]
         colors = directions.new_empty(count, 3)
         kernels, arguments = color_kernels(coefficients, rays, count)
-        launch(colors, kernels.forward, count, arguments, [array(colors, types(real_of(colors)).vec3)])
+        launch(colors, kernels.forward, count, arguments, [colors])
         ctx.save_for_backward(coefficients)
-        ctx.rays = rays
+        ctx.rest = rays
         return colors
 
     @staticmethod
@@ -285,7 +285,7 @@ class _Colors(torch.autograd.Function):
     def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         (coefficients,) = ctx.saved_tensors
         signal = torch.empty_like(coefficients)
-        grad_directions = colors_backward(signal, coefficients, ctx.rays, grad.contiguous(), grad.new_ones(1), True)
+        grad_directions = colors_backward(signal, coefficients, ctx.rest, grad.contiguous(), grad.new_ones(1), True)
         return signal, None, grad_directions
 
 

@@ -11,13 +11,11 @@ import warp as wp
 
 from nexwarp.kernels.hashgrid import hashgrid_kernels
 from nexwarp.kernels.sh import textured_colors_kernels
-from nexwarp.kernels.types import types
 from nexwarp.ops import fused_texture, mlp
 from nexwarp.ops._interop import (
     STORAGES,
     Argument,
     Context,
-    array,
     first_derivative,
     launch,
     real_of,
@@ -74,50 +72,45 @@ def _colors_in_parts(points: Points, field: Field, rays: Rays) -> torch.Tensor:
     return colors
 
 
-class _Context(Context):
-    rays: Rays | None
-    layers: int
-
-
 class _Texture(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: _Context, points: Points, field: Field, rays: Rays | None, keep: bool, *tensors: torch.Tensor | None
+        ctx: Context, points: Points, field: Field, rays: Rays | None, keep: bool, *tensors: torch.Tensor | None
     ) -> torch.Tensor:
         lookup = Lookup(points, field.stored(), field.resolutions)
         matrices = [w.to(lookup.table.dtype) for w in field.weights]
         encoded = lookup.features()
         with torch.autocast(encoded.device.type, enabled=False):
             *layers, coefficients = mlp.outputs(encoded, matrices, keep)
-        ctx.rays = rays and replace(rays, directions=rays.directions[:0])
-        ctx.layers = len(layers)
+        ctx.rest = rays and replace(rays, directions=rays.directions[:0]), len(layers)
         # What was clamped, and how colours follow from directions, is all that the backward pass reads of them.
         read = rays is not None and (rays.clamp or ctx.needs_input_grad[6])
         kept = coefficients if read else coefficients.new_empty(len(coefficients), 0)
         directions = None if rays is None else rays.directions
         inputs = [points.positions, points.depths, points.focal, directions, field.resolutions]
-        ctx.save_for_backward(*inputs, lookup.table, kept, *layers, *matrices)  # type: ignore[arg-type]  # None too
+        ctx.save_for_backward(*inputs, lookup.table, kept, *layers, *matrices)
         if rays is None:
             return coefficients[:, : len(points)].to(field.grid.dtype)
         colors = torch.empty_like(points.positions)
         kernels, arguments = color_kernels(coefficients, rays, len(points))
-        launch(colors, kernels.forward, len(points), arguments, [array(colors, types(real_of(colors)).vec3)])
+        launch(colors, kernels.forward, len(points), arguments, [colors])
         return colors
 
     @staticmethod
     @first_derivative
-    def backward(ctx: _Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         positions, depths, focal, directions, resolutions, table, coefficients, *rest = ctx.saved_tensors
-        layers, matrices = rest[: ctx.layers], rest[ctx.layers :]
+        rays, count = ctx.rest
+        layers, matrices = rest[:count], rest[count:]
         need_positions, need_depths, need_directions, need_grid = ctx.needs_input_grad[4:8]
         scale = gradient_scale(grad, table.dtype)
         signal = coefficients.new_empty(len(coefficients), layers[0].shape[1])
         signal[:, len(positions) :] = 0
         grad_directions = None
-        if ctx.rays is None:
+        if rays is None:
             signal[:, : len(positions)] = grad * scale
         else:
-            rays = replace(ctx.rays, directions=directions)
+            rays = replace(rays, directions=directions)
             grad_directions = colors_backward(signal, coefficients, rays, grad.contiguous(), scale, need_directions)
         unscale = scale.reciprocal()
         with torch.autocast(grad.device.type, enabled=False):
@@ -149,16 +142,14 @@ class Lookup:
         encoded = self.table.new_empty(levels * features, mlp.padded(count, self.table.dtype))
         # Without biases the padding stays 0 through all layers, and adds nothing to any gradient.
         encoded[:, count:] = 0
-        outputs = [array(encoded, STORAGES[self.table.dtype])]
-        launch(self.table, self._kernels(False).forward, (levels, count), self._arguments(), outputs)
+        launch(self.table, self._kernels(False).forward, (levels, count), self._arguments(), [encoded])
         return encoded
 
     def backward(
         self, grad_encoded: torch.Tensor, unscale: torch.Tensor, need_points: bool
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the gradients of the table (L, T, F), and of positions and depths (n, 4) if needed."""
-        real, count = real_of(self.points.positions), len(self.points)
-        levels, _, features = self.table.shape
+        count, levels = len(self.points), len(self.table)
         fixed_point = sums_in_fixed_point(self.table)
         # On a CPU a thread owns the tables of its run of levels; on CUDA a thread takes all levels.
         levels_per_thread = levels if self.table.is_cuda else -(-levels // RUNS)
@@ -168,15 +159,10 @@ class Lookup:
         if fixed_point:
             units = _units(grad_encoded, unscale)
             bad = torch.zeros(1, dtype=torch.int32, device=self.table.device)
-            sums = torch.zeros_like(self.table, dtype=torch.int64)
-            sums_array = array(sums.view(levels, -1), wp.int64)
-        else:
-            sums = torch.zeros_like(self.table, dtype=self.points.positions.dtype)
-            sums_array = array(sums, wp.types.vector(length=features, dtype=real))
-        inputs = [array(grad_encoded, STORAGES[self.table.dtype]), array(unscale, real), array(units, wp.float64)]
-        outputs = [sums_array, array(grad_points, types(real).vec4), array(bad, wp.int32)]
-        arguments = [*self._arguments(), *inputs, levels_per_thread]
-        launch(self.table, self._kernels(fixed_point).backward, (runs, count), arguments, outputs)
+        sums = torch.zeros_like(self.table, dtype=torch.int64 if fixed_point else self.points.positions.dtype)
+        inputs = [*self._arguments(), grad_encoded, unscale, units, levels_per_thread]
+        outputs = [sums.flatten(1) if fixed_point else sums, grad_points, bad]
+        launch(self.table, self._kernels(fixed_point).backward, (runs, count), inputs, outputs)
         if units is not None and bad is not None:
             sums = torch.where(bad.bool(), torch.nan, (sums.double() / units).to(grad_points.dtype))
         return sums, grad_points.sum(0) if runs > 1 else grad_points.view(-1, 4)
@@ -186,16 +172,8 @@ class Lookup:
         return hashgrid_kernels(real, storage, self.table.shape[2], fixed_point)
 
     def _arguments(self) -> list[Argument]:
-        real, storage = real_of(self.points.positions), STORAGES[self.table.dtype]
-        _, size, features = self.table.shape
-        return [
-            array(self.table, wp.types.vector(length=features, dtype=storage)),
-            array(self.points.positions, types(real).vec3),
-            array(self.points.depths, real),
-            array(self.resolutions, real),
-            array(self.points.focal, real),
-            wp.uint32(size - 1),
-        ]
+        points, mask = self.points, wp.uint32(self.table.shape[1] - 1)
+        return [self.table, points.positions, points.depths, self.resolutions, points.focal, mask]
 
 
 def _units(grad_encoded: torch.Tensor, unscale: torch.Tensor) -> torch.Tensor:
@@ -213,7 +191,7 @@ def color_kernels(coefficients: torch.Tensor, rays: Rays, count: int) -> tuple[A
         raise ValueError(f"weights: expected 3 (d + 1)^2 outputs with d of 0 to 3, got {len(coefficients)}")
     kernels = textured_colors_kernels(real, storage, OUTPUTS.index(len(coefficients)), rays.clamp)
     hits = count // max(len(rays.directions), 1)
-    return kernels, [array(coefficients, storage), array(rays.directions, types(real).vec3), hits, rays.offset]
+    return kernels, [coefficients, rays.directions, hits, rays.offset]
 
 
 def colors_backward(
@@ -225,11 +203,8 @@ def colors_backward(
     need_directions: bool,
 ) -> torch.Tensor | None:
     """Write the gradient of the coefficients to `signal`, which has their padded shape; return that of directions."""
-    real = real_of(rays.directions)
-    vec3, count = types(real).vec3, len(grad_colors)
+    count = len(grad_colors)
     slots = grad_colors.new_zeros(count if need_directions else 0, 3)
     kernels, arguments = color_kernels(coefficients, rays, count)
-    arguments += [array(scale, real), array(grad_colors, vec3)]
-    outputs = [array(signal, STORAGES[coefficients.dtype]), array(slots, vec3)]
-    launch(grad_colors, kernels.backward, count, arguments, outputs)
+    launch(grad_colors, kernels.backward, count, [*arguments, scale, grad_colors], [signal, slots])
     return slots.view(len(rays.directions), -1, 3).sum(1) if need_directions else None

@@ -19,7 +19,7 @@ from nexwarp.kernels.tile_lists import (
 from nexwarp.kernels.tiles import MAX_CORNERS, MAX_ENTRIES, check_entries, tile_polygon_kernel
 from nexwarp.kernels.types import types
 from nexwarp.native.warp import tile_size_on
-from nexwarp.ops._interop import Argument, array, launch, real_of, stream_of, struct, warp_array, warp_streams
+from nexwarp.ops._interop import Argument, launch, real_of, stream_of, struct, warp_array, warp_streams
 from nexwarp.ops.memory import check_memory
 from nexwarp.ops.project import Pinhole, Projection
 
@@ -113,10 +113,10 @@ def intersect_tiles(
     kind = columns, rows = -(-camera.width // side), -(-camera.height // side)
     order = _depth_order(projection.centers.detach(), blending)
     polygons, reaches = _tile_polygons(tensors, viewmat, camera, rows)
-    arguments = [array(order, wp.int32), polygons, wp.vec2i(columns, rows)]
+    arguments = [order, polygons, wp.vec2i(columns, rows)]
     threads = list_threads(count, means.is_cuda)
     totals, ends = (torch.empty(count, dtype=x, device=means.device) for x in (torch.int64, torch.int32))
-    launch(means, count_kernel(real), threads, arguments, [array(totals, wp.int64)], sharing=UNEVEN)
+    launch(means, count_kernel(real), threads, arguments, [totals], sharing=UNEVEN)
     _scan(totals)
     learns = room is None and means.is_cuda
     exact = room is None and not learns
@@ -125,10 +125,9 @@ def intersect_tiles(
     # Sorting takes the second half of its arrays as scratch; unused entries sort behind those of the last tile.
     values, tile_ids = ends.new_empty(2 * room), ends.new_empty(2 * room)
     # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
-    surfel_of = array(ends.new_empty(room) if exact else None, wp.int32)
-    emission = [*arguments, array(totals, wp.int64), threads, columns * rows]
-    lists = [array(x, wp.int32) for x in (ends, tile_ids[:room], values[:room])]
-    launch(means, emit_kernel(real), threads, emission, [*lists, surfel_of], sharing=UNEVEN)
+    surfel_of = ends.new_empty(room) if exact else None
+    emission, lists = [*arguments, totals, threads, columns * rows], [ends, tile_ids[:room], values[:room], surfel_of]
+    launch(means, emit_kernel(real), threads, emission, lists, sharing=UNEVEN)
     if not threads:
         values[:room] = 0
         tile_ids[:room] = columns * rows
@@ -138,10 +137,9 @@ def intersect_tiles(
     surfel_ids, entries = values[:room], values[:0]
     if exact:
         surfel_ids, entries = ends.new_empty(room), values[:room]
-        launch(means, surfel_ids_kernel, room, [array(entries, wp.int32), surfel_of], [array(surfel_ids, wp.int32)])
+        launch(means, surfel_ids_kernel, room, [entries, surfel_of], [surfel_ids])
     offsets = order.new_empty(columns * rows + 1)
-    sorted_tiles = array(tile_ids[:room], wp.int32)
-    launch(means, tile_offsets_kernel, len(offsets), [sorted_tiles, room], [array(offsets, wp.int32)])
+    launch(means, tile_offsets_kernel, len(offsets), [tile_ids[:room], room], [offsets])
     return Tiles(order, ends, surfel_ids, entries, offsets, reaches, columns, exact, kind)
 
 
@@ -151,23 +149,15 @@ def _tile_polygons(
     """The tile polygons, as counting and emitting read them, and `Tiles.reaches`."""
     like, count = shape[0], len(shape[0])
     real = real_of(like)
-    t = types(real)
-    dtypes = (t.vec3, t.vec4, t.vec2, real, t.vec2)
-    arguments = [
-        *(array(x, dtype) for x, dtype in zip(shape, dtypes, strict=True)),
-        array(viewmat.contiguous()[None], t.mat44),
-        array(camera.K.contiguous()[None], t.mat33),
-        camera.near,
-        rows,
-    ]
     reaches = like.new_empty(count, 2)
     polygons = struct(
-        t.Polygons,
-        corners=array(like.new_empty(count, MAX_CORNERS, 2), t.vec2),
-        shapes=array(torch.empty(count, 3, dtype=torch.int32, device=like.device), wp.vec3i),
-        margins=array(like.new_empty(count), real),
+        types(real).Polygons,
+        corners=like.new_empty(count, MAX_CORNERS, 2),
+        shapes=torch.empty(count, 3, dtype=torch.int32, device=like.device),
+        margins=like.new_empty(count),
     )
-    launch(like, tile_polygon_kernel(real), count, arguments, [array(reaches, t.vec2), polygons])
+    inputs = [*shape, viewmat.contiguous(), camera.K.contiguous(), camera.near, rows]
+    launch(like, tile_polygon_kernel(real), count, inputs, [reaches, polygons])
     return polygons, reaches
 
 
@@ -175,11 +165,9 @@ def _depth_order(centers: torch.Tensor, blending: Order) -> torch.Tensor:
     """Indices of surfels by signed depth, or distance, of their centres (N, 3), ties by index (the sort is stable)."""
     if blending == "distance":
         centers = torch.cat([centers[:, :2], centers.norm(dim=-1, keepdim=True)], dim=-1)
-    t = types(real_of(centers))
     count = len(centers)
     keys, order = (torch.empty(2 * count, dtype=torch.int32, device=centers.device) for _ in range(2))
-    outputs = [array(keys, wp.uint32), array(order, wp.int32)]
-    launch(centers, depth_keys_kernel(t.real), count, [array(centers.contiguous(), t.vec3)], outputs)
+    launch(centers, depth_keys_kernel(real_of(centers)), count, [centers.contiguous()], [keys, order])
     _sort(keys, order, count, 32)
     return order[:count]
 

@@ -7,7 +7,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.tsdf import BLOCK_SIDE, fuse_kernel
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import array, launch
+from nexwarp.ops._interop import launch
 from nexwarp.ops.memory import check_memory
 
 BYTES_A_VOXEL = 24
@@ -66,21 +66,18 @@ class DistanceField:
         shape = (camera.height, camera.width)
         tensors = {"depths": (depths, shape), "colors": (colors, (*shape, 3)), "viewmat": (camera.viewmat, (4, 4))}
         check_tensors(tensors, dtype=torch.float32, device=self.device)
-        t = types(wp.float32)
         inputs = [
-            array(self.blocks, wp.vec3i),
+            self.blocks,
             self.voxel,
             self.truncation,
-            array(camera.viewmat.contiguous()[None], t.mat44),
-            t.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
+            camera.viewmat.contiguous(),
+            types(wp.float32).vec4(camera.fx, camera.fy, camera.cx, camera.cy),
             wp.vec2i(camera.width, camera.height),
             camera.near,
-            array(depths.contiguous(), wp.float32),
-            array(colors.contiguous(), t.vec3),
+            depths.contiguous(),
+            colors.contiguous(),
         ]
-        outputs = [array(x, wp.float32) for x in (self.distances, self.weights)]
-        outputs.append(array(self.means, t.vec4))
-        launch(depths, fuse_kernel(), self.distances.numel(), inputs, outputs)
+        launch(depths, fuse_kernel(), self.distances.numel(), inputs, [self.distances, self.weights, self.means])
 
     def neighbors(self, offset: tuple[int, int, int]) -> torch.Tensor:
         """Return the index (B,) of each block's neighbour at an offset in blocks; B where there is none."""

@@ -2,9 +2,8 @@
 
 import torch
 
-from nexwarp.kernels.types import types
 from nexwarp.kernels.unproject import unproject_kernels
-from nexwarp.ops._interop import Argument, Context, array, first_derivative, launch, real_of
+from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, real_of
 from nexwarp.ops.project import Pinhole
 
 
@@ -23,21 +22,18 @@ def unproject(depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole) -> t
     return _Unproject.apply(depths.contiguous(), viewmat.contiguous(), camera)
 
 
-class _Context(Context):
-    camera: Pinhole
-
-
 class _Unproject(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: _Context, depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole
+        ctx: Context, depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole
     ) -> tuple[torch.Tensor, torch.Tensor]:
         positions = depths.new_empty(*depths.shape, 3)
         directions = depths.new_empty(*depths.shape[:2], 3)
-        kernel, pixels = unproject_kernels(real_of(depths)).forward, depths.shape[0] * depths.shape[1]
-        launch(depths, kernel, pixels, _inputs(depths, viewmat, camera), _outputs(positions, directions))
+        inputs = [depths, viewmat, camera.K.contiguous(), camera.width]
+        pixels = depths.shape[0] * depths.shape[1]
+        launch(depths, unproject_kernels(real_of(depths)).forward, pixels, inputs, [positions, directions])
         ctx.save_for_backward(depths, viewmat)
-        ctx.camera = camera
+        ctx.rest = camera
         ctx.set_materialize_grads(False)
         if not ctx.needs_input_grad[1]:
             # They depend on the camera alone: saves the texture the work of differentiating them.
@@ -47,30 +43,17 @@ class _Unproject(torch.autograd.Function):
     @staticmethod
     @first_derivative
     def backward(
-        ctx: _Context, grad_positions: torch.Tensor | None, grad_directions: torch.Tensor | None
+        ctx: Context, grad_positions: torch.Tensor | None, grad_directions: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:
         depths, viewmat = ctx.saved_tensors
         need_depths, need_viewmat, _ = ctx.needs_input_grad
         if grad_positions is None and grad_directions is None:
             return None, None, None
-        pixels, real = depths.shape[0] * depths.shape[1], real_of(depths)
+        camera, pixels = ctx.rest, depths.shape[0] * depths.shape[1]
         grad_depths = torch.empty_like(depths) if need_depths else None
         # A slot a pixel, then one sum: no contention, and a fixed order.
         grad_viewmats = viewmat.new_empty(pixels, 4, 4) if need_viewmat else None
-        inputs = [*_inputs(depths, viewmat, ctx.camera), *_outputs(grad_positions, grad_directions)]
-        flat = None if grad_depths is None else grad_depths.flatten(0, 1)
-        outputs = [array(flat, real), array(grad_viewmats, types(real).mat44)]
-        launch(depths, unproject_kernels(real).backward, pixels, inputs, outputs)
+        inputs = [depths, viewmat, camera.K.contiguous(), camera.width, *contiguous(grad_positions, grad_directions)]
+        kernel = unproject_kernels(real_of(depths)).backward
+        launch(depths, kernel, pixels, inputs, [grad_depths, grad_viewmats])
         return grad_depths, None if grad_viewmats is None else grad_viewmats.sum(0), None
-
-
-def _inputs(depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole) -> list[Argument]:
-    t = types(real_of(depths))
-    K = array(camera.K.contiguous()[None], t.mat33)
-    return [array(depths.flatten(0, 1), t.real), array(viewmat[None], t.mat44), K, camera.width]
-
-
-def _outputs(positions: torch.Tensor | None, directions: torch.Tensor | None) -> list[Argument]:
-    """View positions and directions, or their gradients, as the kernels do: one row a pixel."""
-    given = [None if x is None else x.contiguous().flatten(0, 1) for x in (positions, directions)]
-    return [None if x is None else array(x, types(real_of(x)).vec3) for x in given]
