@@ -11,7 +11,6 @@ from benchmarks.scenes import SAHAROV, SurfelScene, geometry, random_like, textu
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 from nexwarp import ops
-from nexwarp.model.texture import limited_depths
 from nexwarp.train.finish import measure_detail_limits
 
 
@@ -24,7 +23,7 @@ def texturing(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[M
         hits = g.hits(max_hits)
         positions, directions = ops.unproject(hits.depths, g.viewmat, g.pinhole)
     focal = scene.camera.focal
-    depths = limited_depths(hits.ids, hits.depths, limits, focal).requires_grad_()
+    depths = ops.limit_depths(hits.ids, hits.depths, limits.nearest, limits.farthest, focal).requires_grad_()
     positions.requires_grad_()
 
     def colors() -> torch.Tensor:

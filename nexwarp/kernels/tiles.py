@@ -33,17 +33,6 @@ LARGEST_INT = 2**31 - 1
 MAX_ENTRIES = 2**30 - 1
 
 
-def check_entries(total: int, count: int, tiles: int) -> int:
-    """Return the number of (tile, surfel) entries; ValueError when lists cannot be as long."""
-    if total > MAX_ENTRIES:
-        number = f"{total:,}{' or more' if total >= LARGEST_INT else ''}"
-        raise ValueError(
-            f"surfels: expected at most {MAX_ENTRIES:,} (tile, surfel) entries, got {number}, of {count:,} surfels and "
-            f"{tiles:,} tiles; render fewer or smaller surfels, or the image in parts (Camera.crop)"
-        )
-    return total
-
-
 @wp.func
 def pixel_of_point(x: Vec3, intrinsics: Vec4):
     """Pixel coordinates of a point in the camera frame."""

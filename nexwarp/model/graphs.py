@@ -187,7 +187,8 @@ class FrameGraphs:
             with self.using():
                 captured.take(frame)
                 captured.graph.replay()
-                image, held = captured.image.clone(), ops.held(captured.room)  # both read the graph's memory
+                image = captured.image.clone()  # this and the next line read the graph's memory
+                held = ops.fits(captured.room, margin=False)
             if not held:
                 # What was rendered is right, but slow, as the next frame by this graph would be.
                 del self.frames[captured.kind]

@@ -12,7 +12,7 @@ from nexwarp.machine import keep_freed_memory, needed_memory
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Color, RenderOptions, color_tensor
 from nexwarp.model.surfels import Activated, Surfels
-from nexwarp.model.texture import DetailLimits, Hits, NeuralTexture, Texture, limited_depths
+from nexwarp.model.texture import DetailLimits, Hits, NeuralTexture, Texture
 from nexwarp.ops.tiles import Order
 
 MAX_JITTER = 1000.0  # pixels
@@ -302,7 +302,9 @@ def _texels(
         expected = {"texture.colors": (colors, tuple(positions.shape))}
         check_tensors(expected, dtype=positions.dtype, device=positions.device)
         return (colors.clamp_min(0) if options.clamp_texture else colors).contiguous()
-    found = replace(found, depths=limited_depths(hits.ids, hits.depths, limits, camera.focal))
+    if limits is not None:
+        depths = ops.limit_depths(hits.ids, hits.depths, limits.nearest, limits.farthest, camera.focal)
+        found = replace(found, depths=depths)
     return texture.colors(found, camera, sh_degree=options.sh_degree, clamp=options.clamp_texture)
 
 

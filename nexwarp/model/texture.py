@@ -385,12 +385,3 @@ class DetailLimits(nn.Module):
 
     def __len__(self) -> int:
         return len(self.nearest)
-
-
-def limited_depths(
-    ids: torch.Tensor, depths: torch.Tensor, limits: DetailLimits | None, focal: float | torch.Tensor
-) -> torch.Tensor:
-    """Return the depths (H, W, K) of hits, clamped to the range of the training views, for the down-weighting."""
-    if limits is None or not len(limits):
-        return depths
-    return ops.limit_depths(ids, depths, limits.nearest, limits.farthest, focal)

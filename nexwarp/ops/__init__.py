@@ -13,7 +13,7 @@ from nexwarp.ops.project import Pinhole, Projection, project
 from nexwarp.ops.sh import plain_colors
 from nexwarp.ops.surface import DifferentiableSurface, Surface, surface
 from nexwarp.ops.texture import texture
-from nexwarp.ops.tiles import ListCapacity, Tiles, UnknownLengthError, fits, held, intersect_tiles
+from nexwarp.ops.tiles import ListCapacity, Tiles, UnknownLengthError, fits, intersect_tiles
 from nexwarp.ops.unproject import unproject
 
 __all__ = [
@@ -37,7 +37,6 @@ __all__ = [
     "compose",
     "expose",
     "fits",
-    "held",
     "intersect_tiles",
     "limit_depths",
     "plain_colors",

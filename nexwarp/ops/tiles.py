@@ -16,7 +16,7 @@ from nexwarp.kernels.tile_lists import (
     surfel_ids_kernel,
     tile_offsets_kernel,
 )
-from nexwarp.kernels.tiles import MAX_CORNERS, MAX_ENTRIES, check_entries, tile_polygon_kernel
+from nexwarp.kernels.tiles import LARGEST_INT, MAX_CORNERS, MAX_ENTRIES, tile_polygon_kernel
 from nexwarp.kernels.types import types
 from nexwarp.native.warp import tile_size_on
 from nexwarp.ops._interop import Argument, launch, real_of, stream_of, struct, warp_array, warp_streams
@@ -191,7 +191,14 @@ def _scan(counts: torch.Tensor) -> None:
 
 
 def _total(totals: torch.Tensor, tiles: int) -> int:
-    total = check_entries(int(totals[-1]), len(totals), tiles) if len(totals) else 0
+    """Return the number of entries; ValueError or OutOfMemoryError when lists cannot be as long."""
+    total = int(totals[-1]) if len(totals) else 0
+    if total > MAX_ENTRIES:
+        number = f"{total:,}{' or more' if total >= LARGEST_INT else ''}"
+        raise ValueError(
+            f"surfels: expected at most {MAX_ENTRIES:,} (tile, surfel) entries, got {number}, of {len(totals):,} "
+            f"surfels and {tiles:,} tiles; render fewer or smaller surfels, or the image in parts (Camera.crop)"
+        )
     check_memory(BYTES_AN_ENTRY * total, totals.device, f"a list of {total:,} (tile, surfel) entries")
     return total
 
@@ -259,24 +266,16 @@ def _key(ends: torch.Tensor, kind: tuple[int, int]) -> tuple[int | None, int, in
     return (ends.device.index, len(ends).bit_length(), *kind)
 
 
-def fits(room: ListCapacity) -> bool:
-    """Whether lists that a CUDA graph fills are as long as renderings of their kind need; call after each replay."""
-    enough = _room(room.ends, room.kind) <= room.entries
-    _ask(room.ends, room.kind)
-    return enough
+def fits(room: ListCapacity, *, margin: bool = True) -> bool:
+    """Whether lists that a CUDA graph fills are as long as renderings of their kind need; call after each replay.
 
-
-def held(room: ListCapacity) -> bool:
-    """Whether lists that a CUDA graph fills have held all entries as far as is known now; call after each replay.
-
-    Unlike `fits` it asks for no margin: cameras that move would need a new graph whenever they see a little more.
+    Without `margin`, whether they have held all entries as far as is known now: cameras that move would need a new
+    graph whenever they see a little more.
     """
-    if len(room.ends) == 0:
-        return True
-    _room(room.ends, room.kind)
+    wanted = _room(room.ends, room.kind)
     _ask(room.ends, room.kind)
-    need = _needs.get(_key(room.ends, room.kind))
-    return need is None or need.most <= room.entries
+    need = None if margin else _needs.get(_key(room.ends, room.kind))
+    return (wanted if need is None else need.most) <= room.entries
 
 
 def _with_margin(total: int) -> int:

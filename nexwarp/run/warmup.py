@@ -11,7 +11,6 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene, View
 from nexwarp.ops import start_warp
 from nexwarp.run.evaluate import evaluate
-from nexwarp.train.densify import least_contributing
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
 from nexwarp.train.trainer import Trainer
 
@@ -29,7 +28,7 @@ def rehearse(config: Config, device: torch.device, done: Callable[[], None] = la
     trainer = Trainer(scene, tiny(config), device)
     trainer.run(lambda _: done())
     if config.densify.relocate:
-        least_contributing(trainer.model(), trainer.views.cameras, config.densify.relocate)
+        trainer.densifier.unneeded(trainer.model(), trainer.views.cameras)
     model = trainer.finish()
     evaluate(model, scene.test)
     with torch.no_grad():

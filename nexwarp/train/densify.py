@@ -59,14 +59,28 @@ class DensityControl:
         full = len(self.surfels) >= FULL * self.max_surfels
         return c.relocate > 0 and rare and iteration < RELOCATE_UNTIL * c.stop and full
 
+    @torch.no_grad()
     def unneeded(
         self,
         model: Model,
         cameras: Sequence[Camera],
         largest: Callable[[torch.Tensor], torch.Tensor] = lambda values: values,
     ) -> torch.Tensor:
-        """Return the surfels (N,) bool of a model to remove in such a round; see `least_contributing`."""
-        return least_contributing(model, cameras, self.config.relocate, largest)
+        """Return the surfels (N,) bool of a model to remove in such a round: those that contribute least to any image.
+
+        A surfel's contribution to an image is the sum of its blending weights over the pixels; what counts is the image
+        to which it contributes most. Images are rendered at half the size, each weighing all its pixels alike.
+        `largest` takes the contributions (N,) to these images, and returns the largest of all ranks.
+        """
+        bare = model.bare()
+        most = torch.zeros_like(bare.surfels.logit_opacities)
+        for camera in cameras:
+            out = bare.render(reduced(camera, max(camera.height // 2, 1)))
+            most = torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1.0 / out.alpha.numel())))
+        most = largest(most)
+        chosen = torch.zeros(len(most), dtype=torch.bool, device=most.device)
+        chosen[most.argsort(stable=True)[: int(self.config.relocate * len(most))]] = True
+        return chosen
 
     def accumulate(self, errors: torch.Tensor) -> None:
         """Add the blended errors (N,) >= 0 of one view, such as `Rendering.splat_error` returns them."""
@@ -207,27 +221,3 @@ def _take_rows(
         if optimizer.state.pop(old, None) is not None:
             optimizer.state[new] = {**state, **moved}
     setattr(owner, leaf, new)
-
-
-@torch.no_grad()
-def least_contributing(
-    model: Model,
-    cameras: Sequence[Camera],
-    share: float,
-    largest: Callable[[torch.Tensor], torch.Tensor] = lambda values: values,
-) -> torch.Tensor:
-    """Return (N,) bool, True for the share of the surfels that contribute least to any image.
-
-    A surfel's contribution to an image is the sum of its blending weights over the pixels; what counts is the image to
-    which it contributes most. Images are rendered at half the size, each weighing all its pixels alike. `largest` takes
-    the contributions (N,) to these images, and returns the largest of all ranks.
-    """
-    bare = model.bare()
-    most = torch.zeros_like(bare.surfels.logit_opacities)
-    for camera in cameras:
-        out = bare.render(reduced(camera, max(camera.height // 2, 1)))
-        most = torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1.0 / out.alpha.numel())))
-    most = largest(most)
-    chosen = torch.zeros(len(most), dtype=torch.bool, device=most.device)
-    chosen[most.argsort(stable=True)[: int(share * len(most))]] = True
-    return chosen

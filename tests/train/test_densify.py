@@ -15,7 +15,7 @@ from nexwarp.data import Scene
 from nexwarp.model.render import render
 from nexwarp.model.surfels import PARAMETERS
 from nexwarp.train import densify
-from nexwarp.train.densify import DensityControl, least_contributing, split_surfels
+from nexwarp.train.densify import DensityControl, split_surfels
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import Config, DensifyConfig
 from nexwarp.train.trainer import Trainer
@@ -359,22 +359,26 @@ def test_what_no_image_shows_goes_first(tiny_scene: Scene) -> None:
         surfels.means[hidden[::2]] += 1e4
         surfels.logit_opacities[hidden[1::2]] = -20.0
     cameras = [view.camera for view in tiny_scene.train]
-    share = len(hidden) / len(surfels) + 1e-6
-    chosen = least_contributing(trainer.model(), cameras, share)
+
+    def least_contributing(share: float) -> torch.Tensor:
+        return densifier_of(surfels, relocate=share).unneeded(trainer.model(), cameras)
+
+    chosen = least_contributing(len(hidden) / len(surfels) + 1e-6)
     assert torch.equal(chosen.nonzero()[:, 0], hidden)
-    chosen = least_contributing(trainer.model(), cameras, 0.5)
+    chosen = least_contributing(0.5)
     assert chosen.sum() == len(surfels) // 2 and chosen[hidden].all()
     most = torch.zeros(len(surfels))
     for camera in cameras:  # at full size, a sum of weights is that of half the size but for aliasing
         out = render(surfels, None, camera)
         most = torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1 / out.alpha.numel())))
     assert most[chosen].mean() < 0.2 * most[~chosen].mean()
-    assert not least_contributing(trainer.model(), cameras, 0.0).any()
+    assert not least_contributing(0.0).any()
 
 
 def test_ranks_share_the_views(tiny_scene: Scene, tmp_path: Path) -> None:
     """Each renders some of them, and all choose what one process would."""
     model = Trainer(tiny_scene, small(iterations=30), "cpu").model()
+    control = densifier_of(model.surfels, relocate=0.3)
     cameras = [view.camera for view in tiny_scene.train]
     rendered: list[int] = []
 
@@ -386,10 +390,10 @@ def test_ranks_share_the_views(tiny_scene: Scene, tmp_path: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(densify, "reduced", noted)
             mine = cameras[ranks.rank :: ranks.size]
-            return least_contributing(model, mine, 0.3, ranks.largest).tolist(), len(rendered)
+            return control.unneeded(model, mine, ranks.largest).tolist(), len(rendered)
 
     found = run_ranks(3, work, tmp_path)
-    expected = least_contributing(model, cameras, 0.3)
+    expected = control.unneeded(model, cameras)
     counts = [len(cameras[rank::3]) for rank in range(3)]
     assert found == [[expected.tolist(), count] for count in counts] and 0 < expected.sum() < len(expected)
 
@@ -412,16 +416,16 @@ def test_rounds_at_the_budget_relocate_in_the_first_part_of_density_control() ->
 def test_others_take_their_place(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     removed = []
 
-    def first(model, cameras, share, _):
-        removed.append((trainer.iteration, len(model.surfels), len(cameras), share))
-        return torch.arange(len(model.surfels)) < share * len(model.surfels)
+    def first(control, model, cameras):
+        removed.append((trainer.iteration, len(model.surfels), len(cameras)))
+        return torch.arange(len(model.surfels)) < control.config.relocate * len(model.surfels)
 
-    monkeypatch.setattr(densify, "least_contributing", first)
+    monkeypatch.setattr(DensityControl, "unneeded", first)
     config = small(iterations=120, densify=dataclasses.replace(OFTEN, relocate=0.2, prune_opacity=0.0, fraction=0.2))
     budget = 50
     trainer = Trainer(tiny_scene, dataclasses.replace(config, max_surfels=budget), "cpu")
     counts: dict[int, int] = {}
     trainer.run(observe=lambda progress: counts.update({progress.iteration: progress.surfels}))
     assert [iteration for iteration, *_ in removed] == [30]
-    assert all(before[1:] == (budget, len(tiny_scene.train), 0.2) for before in removed)
+    assert all(before[1:] == (budget, len(tiny_scene.train)) for before in removed)
     assert counts[30] == counts[33] == budget, "as many are split as were removed"

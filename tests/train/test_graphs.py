@@ -253,7 +253,7 @@ def test_lists_that_outgrow_a_graph_are_recorded_anew(tiny_scene: Scene, monkeyp
     trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
     asked: list[ops.ListCapacity] = []
 
-    def fits(room: ops.ListCapacity) -> bool:
+    def fits(room: ops.ListCapacity, **_: bool) -> bool:
         asked.append(room)
         return len(asked) % 7 > 0
 
@@ -283,7 +283,7 @@ def test_rounds_at_the_budget_keep_the_graph(tiny_scene: Scene, monkeypatch: pyt
             replaced.append(trainer.iteration)
         return rows
 
-    monkeypatch.setattr(ops, "fits", lambda room: True)  # short lists are slow but right, and no reason here
+    monkeypatch.setattr(ops, "fits", lambda room, **_: True)  # short lists are slow but right, and no reason here
     monkeypatch.setattr(step_graphs, "_stacked", noted)
     monkeypatch.setattr(DensityControl, "step", counted)
     trainer.run()
