@@ -212,13 +212,10 @@ def scatter_function(real: type, features: int, fixed_point: bool) -> wp.Functio
 
 @functools.cache
 def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool = False) -> SimpleNamespace:
-    """Make the forward and backward kernels.
+    """Make the forward and backward kernels, for 1, 2, 4 or 8 features a level.
 
-    Args:
-        real: scalar type of positions, table gradients and arithmetic.
-        storage: scalar type of the table and of the features written (`real` or wp.float16).
-        features: features a level, 1, 2, 4 or 8.
-        fixed_point: let the backward kernel add to the table in fixed point, as integers, `units` of them in 1.
+    Positions, table gradients and arithmetic are of the type `real`, the table and the features written of `storage`,
+    `real` or wp.float16. With `fixed_point` the backward kernel adds to the table integers, `units` of them in 1.
     """
     t = types(real)
     vec3, vec4 = t.vec3, t.vec4

@@ -26,17 +26,11 @@ LIGHT_CHUNK = 4096
 
 @dataclass(frozen=True)
 class Sharing:
-    """How CPU threads share a launch out.
+    """How CPU threads share a launch out."""
 
-    Attributes:
-        smallest: what one thread is given at least.
-        align: runs of this many neighbours stay in one thread, since they write to the same place.
-        even: whether equal parts of the range take about equally long.
-    """
-
-    smallest: int = LIGHT_CHUNK
-    align: int = 1
-    even: bool = True
+    smallest: int = LIGHT_CHUNK  # what one thread is given at least
+    align: int = 1  # runs of this many neighbours stay in one thread, since they write to the same place
+    even: bool = True  # whether equal parts of the range take about equally long
 
 
 LIGHT, UNEVEN = Sharing(), Sharing(even=False)

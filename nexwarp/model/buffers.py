@@ -58,12 +58,8 @@ def render_buffers(model: Model, camera: Camera, **changes: Unpack[RenderChanges
 def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
     """Write one multi-part OpenEXR file, with one part per buffer, or per slot of a buffer that has K slots.
 
-    docs/outputs.md describes it. The text attribute `nexwarp` holds camera, background and K as JSON; a background of
-    shape (H, W, 3) is null there, and a part `background`.
-
-    Raises:
-        TypeError: a buffer is not float32.
-        OSError: `path` cannot be written.
+    The text attribute `nexwarp` holds camera, background and K as JSON; a background of shape (H, W, 3) is null there,
+    and a part `background`. TypeError where a buffer is not float32, OSError where `path` cannot be written.
     """
     parts: dict[str, torch.Tensor] = {}
     for name in PASSES:
@@ -93,12 +89,7 @@ def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
 
 
 def load_buffers(path: str | os.PathLike[str]) -> Buffers:
-    """Read a file of `save_buffers` onto the CPU, bit for bit.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file has another format, or is damaged.
-    """
+    """Read a file of `save_buffers` onto the CPU, bit for bit; ValueError where it has another format or is damaged."""
     path = Path(path)
     parts, metadata = load_exr(path)
     try:

@@ -50,19 +50,12 @@ class Face(Camera):
 
 @dataclass(frozen=True)
 class Look:
-    """Where pixels of a ray camera lie in the rendering of a face.
-
-    Attributes:
-        rendering: of the face.
-        pixels: (P,) int64, row * width + column of the ray camera.
-        places: (P, 2) their x and y in the face, -1 and 1 at its borders.
-        lengths: (P,) length along the face's axis of their rays' vectors.
-    """
+    """Where pixels of a ray camera lie in the rendering of a face."""
 
     rendering: Rendering
-    pixels: torch.Tensor
-    places: torch.Tensor
-    lengths: torch.Tensor
+    pixels: torch.Tensor  # (P,) int64, row * width + column of the ray camera
+    places: torch.Tensor  # (P, 2) their x and y in the face, -1 and 1 at its borders
+    lengths: torch.Tensor  # (P,) length along the face's axis of their rays' vectors
 
     def sampled(self, values: torch.Tensor, mode: str) -> torch.Tensor:
         """Return values (side, side, ...) at the places, (P, ...), `mode` being bilinear or nearest."""

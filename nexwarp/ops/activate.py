@@ -14,29 +14,15 @@ def activate(
     logit_opacities: torch.Tensor,
     raw_gammas: torch.Tensor,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Activate raw parameters, all in one kernel; differentiable with respect to every argument.
+    """Return quats (N, 4) of unit length, scales (N, 2), opacities (N,) and gammas (N, 2) of raw ones, see `Surfels`.
 
-    Args:
-        raw_quats: (N, 4) wxyz, of any length; one shorter than 1e-12 is divided by 1e-12.
-        log_scales: (N, 2) logarithms of world units.
-        logit_opacities: (N,).
-        raw_gammas: (N, 2), logarithms of gamma - 1.
-
-    Returns:
-        (N, 4) unit quaternions, wxyz; (N, 2) scales, world units; (N,) opacities in [0, 1]; (N, 2) gammas >= 1.
-
-    Raises:
-        TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
+    All in one kernel; differentiable with respect to every argument. A quaternion shorter than 1e-12 is divided by
+    1e-12. TypeError or ValueError where types, shapes or devices do not fit.
     """
-    check_tensors(
-        {
-            "raw_quats": (raw_quats, ("N", 4)),
-            "log_scales": (log_scales, ("N", 2)),
-            "logit_opacities": (logit_opacities, ("N",)),
-            "raw_gammas": (raw_gammas, ("N", 2)),
-        }
-    )
-    return _Activate.apply(*(x.contiguous() for x in (raw_quats, log_scales, logit_opacities, raw_gammas)))
+    raw = (raw_quats, log_scales, logit_opacities, raw_gammas)
+    shapes = {"raw_quats": ("N", 4), "log_scales": ("N", 2), "logit_opacities": ("N",), "raw_gammas": ("N", 2)}
+    check_tensors({name: (x, shape) for x, (name, shape) in zip(raw, shapes.items(), strict=True)})
+    return _Activate.apply(*(x.contiguous() for x in raw))
 
 
 def parameters(

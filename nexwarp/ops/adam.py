@@ -14,17 +14,11 @@ SMALLEST_SHARE = 64  # threads of a chunk on a CPU, at least
 
 
 class Moments(NamedTuple):
-    """What Adam keeps of a parameter.
+    """What Adam keeps of a parameter."""
 
-    Attributes:
-        step: () float32, number of steps.
-        mean: of the parameter's shape, exponential average of gradients.
-        square: likewise of squared gradients.
-    """
-
-    step: torch.Tensor
-    mean: torch.Tensor
-    square: torch.Tensor
+    step: torch.Tensor  # () float32, number of steps
+    mean: torch.Tensor  # of the parameter's shape, exponential average of gradients
+    square: torch.Tensor  # likewise of squared gradients
 
 
 def adam_step(
@@ -40,19 +34,10 @@ def adam_step(
 ) -> torch.Tensor | None:
     """Update a parameter and its averages in place, as `torch.optim.Adam` does, to float32 rounding.
 
-    Args:
-        parameter: float32, contiguous.
-        grad: of its shape; None is zero.
-        moments: of the parameter; their `step` is the number of this step, from 1.
-        rate: () float32, learning rate.
-        betas: decay of the two averages.
-        epsilon: added to the denominator.
-        factors: (L,) adds the gradient of sum_l factors[l] sum(H_l^2); the parameter is then a grid H (L, T, F) whose
-            T * F is a power of two.
-        half: of its shape, float16, becomes the new values.
-
-    Returns:
-        With `factors`, that sum before the step, a scalar; None without.
+    The parameter is float32 and contiguous; a gradient of None is zero; `moments.step` is the number of this step, from
+    1; `rate` is () float32; `half`, float16, becomes the new values. With `factors` (L,), the parameter is a grid H
+    (L, T, F) whose T * F is a power of two, and the gradient of sum_l factors[l] sum(H_l^2) is added: that sum before
+    the step, a scalar, is returned.
     """
     count = parameter.numel()
     threads = -(-count // (VALUES if parameter.is_cuda else CPU_VALUES))

@@ -45,29 +45,17 @@ class SplatErrorRequest:
 
 @dataclass(frozen=True)
 class Hits:
-    """Outputs of the collection pass.
+    """Outputs of the collection pass; differentiable but for integers."""
 
-    Attributes:
-        plain: (H, W, 3) sum of weight * plain colour over the hits outside the buffer (N, paper Eq. 6); differentiable.
-        base: (H, W, 3) the same sum over the hits in the buffer: their colour without a texture; differentiable.
-        ids: (H, W, K) int32 surfels, heaviest hit first, -1 in empty slots.
-        depths: (H, W, K) z-depths in world units, 0 in empty slots; differentiable.
-        weights: (H, W, K), 0 in empty slots; differentiable.
-        alpha: (H, W) 1 - final transmittance; differentiable.
-        stops: (H, W) int32, end of the part of the tile's list that the pixel's walk took.
-        error_request: request for blended errors, empty at first.
-        channels: (H, W, 16) as `plain`, of sixteen more channels; None without them; differentiable.
-    """
-
-    plain: torch.Tensor
-    base: torch.Tensor
-    ids: torch.Tensor
-    depths: torch.Tensor
-    weights: torch.Tensor
-    alpha: torch.Tensor
-    stops: torch.Tensor
-    error_request: SplatErrorRequest
-    channels: torch.Tensor | None = None
+    plain: torch.Tensor  # (H, W, 3) sum of weight * plain colour over the hits outside the buffer (N, paper Eq. 6)
+    base: torch.Tensor  # (H, W, 3) the same sum over the hits in the buffer: their colour without a texture
+    ids: torch.Tensor  # (H, W, K) int32 surfels, heaviest hit first, -1 in empty slots
+    depths: torch.Tensor  # (H, W, K) z-depths in world units, 0 in empty slots
+    weights: torch.Tensor  # (H, W, K), 0 in empty slots
+    alpha: torch.Tensor  # (H, W) 1 - final transmittance
+    stops: torch.Tensor  # (H, W) int32, end of the part of the tile's list that the pixel's walk took
+    error_request: SplatErrorRequest  # empty at first
+    channels: torch.Tensor | None = None  # (H, W, 16) as `plain`, of sixteen more channels
 
 
 def collect(
@@ -80,12 +68,7 @@ def collect(
 ) -> Hits:
     """Walk every pixel's list front to back; differentiable with respect to the projection's records and `channels`.
 
-    Args:
-        projection: surfels in the camera's frame.
-        tiles: their lists.
-        camera: the image plane.
-        max_hits: K, length of the buffer, 0 to 8.
-        channels: (N, 16) sixteen more channels of the plain colour, or None.
+    K is `max_hits`, 0 to 8; `channels` (N, 16) are more channels of the plain colour.
     """
     if not 0 <= max_hits <= MAX_HITS:
         raise ValueError(f"max_hits: expected 0 to {MAX_HITS}, got {max_hits}")
@@ -104,17 +87,9 @@ def collect(
 def splat_error(
     projection: Projection, tiles: Tiles, hits: Hits, camera: Pinhole, errors: torch.Tensor
 ) -> torch.Tensor:
-    """Give each surfel the sum over pixels of its blending weight times the pixel's error.
+    """Return each surfel's sum (N,) over pixels of blending weight * errors (H, W) >= 0. Not differentiable.
 
-    Args:
-        projection: as given to `collect`.
-        tiles: as given to `collect`.
-        hits: as returned by `collect`.
-        camera: as given to `collect`.
-        errors: (H, W) error of each pixel, >= 0.
-
-    Returns:
-        (N,) blended errors. Not differentiable.
+    Hits are those of `collect`, whose arguments the others are.
     """
     check_tensors({"errors": (errors, (camera.height, camera.width))}, device=projection.records.device)
     scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera)

@@ -16,17 +16,8 @@ def compose(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Add up the passes (paper Eq. 7); differentiable in every argument.
 
-    Args:
-        plain: (H, W, 3) colour of the hits outside the buffer.
-        colors: (H, W, K, 3) colours of the hits in the buffer.
-        weights: (H, W, K) their weights.
-        alpha: (H, W).
-        background: (3,).
-        base: (H, W, 3) what `colors` are added to, once blended; None where they stand alone.
-
-    Returns:
-        (H, W, 3) image = plain + textured + (1 - alpha) background, and (H, W, 3) textured = base + sum_k weight_k
-        colour_k.
+    Return image = plain + textured + (1 - alpha) background and textured = base + sum_k weights_k colors_k, (H, W, 3)
+    as plain and base are; colors (H, W, K, 3), weights (H, W, K), alpha (H, W), background (3,).
     """
     return _Compose.apply(*contiguous(plain, base, colors, weights, alpha, background))
 

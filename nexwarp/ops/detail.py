@@ -18,21 +18,9 @@ def antialias(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Blur surfels where a pixel covers more of them than it did in training.
 
+    Return scales (N, 2), opacities (N,) and gammas (N, 2); those given where the centre's z-depth (N,) over the focal
+    length, pixels, a number or a tensor (1,), is no larger than `farthest` (N,), the largest of the training views.
     Differentiable with respect to all arguments but `farthest` and `focal`.
-
-    Args:
-        depths: (N,) z-depths of the centres, world units.
-        scales: (N, 2) world units.
-        opacities: (N,).
-        gammas: (N, 2).
-        farthest: (N,) largest depth / focal at which a training view saw the surfel, world units.
-        focal: of the camera, pixels; a number, or a tensor (1,) on the device.
-
-    Returns:
-        (N, 2) scales, (N,) opacities and (N, 2) gammas; those given where depth / focal is no larger than in training.
-
-    Raises:
-        TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
     """
     check_tensors(
         {
@@ -78,14 +66,10 @@ def limit_depths(
     farthest: torch.Tensor,
     focal: float | torch.Tensor,
 ) -> torch.Tensor:
-    """Clamp depths to at most focal * farthest, then to at least focal * nearest; differentiable in depths.
+    """Clamp depths (H, W, K) to at most focal * farthest, then to at least focal * nearest; differentiable in depths.
 
-    Args:
-        ids: (H, W, K) int32 surfels of the hits, -1 in empty slots, whose depths stay.
-        depths: (H, W, K) z-depths of the hits, world units.
-        nearest: (N,) smallest depth / focal, world units.
-        farthest: (N,) largest depth / focal.
-        focal: in pixels, a number or a tensor (1,) on the device.
+    Hits are of the surfels `ids` (H, W, K) int32, of which -1 leaves the depth; limits (N,) are depth / focal, world
+    units; `focal` is in pixels, a number or a tensor (1,) on the device.
     """
     focal = focal.to(depths) if isinstance(focal, torch.Tensor) else depths.new_full((1,), float(focal))
     return _LimitDepths.apply(ids, depths.contiguous(), nearest.contiguous(), farthest.contiguous(), focal)

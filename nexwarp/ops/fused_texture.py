@@ -67,17 +67,11 @@ def usable(points: Points, field: Field, rays: Rays) -> bool:
 
 
 class Kept(NamedTuple):
-    """What the backward pass needs of the forward pass.
+    """What the backward pass needs of the forward pass."""
 
-    Attributes:
-        encoded: the features as fragments, 64 bytes a point; empty if there will be no backward pass.
-        packed: the matrices in half precision, in the order in which the kernels' lanes load them.
-        colors: (n, 3) the result if it was clamped, else empty.
-    """
-
-    encoded: torch.Tensor
-    packed: torch.Tensor
-    colors: torch.Tensor
+    encoded: torch.Tensor  # the features as fragments, 64 bytes a point; empty if there will be no backward pass
+    packed: torch.Tensor  # the matrices in half precision, in the order in which the kernels' lanes load them
+    colors: torch.Tensor  # (n, 3) the result if it was clamped, else empty
 
 
 def colors(points: Points, field: Field, rays: Rays, *, keep: bool) -> torch.Tensor:
@@ -211,11 +205,7 @@ def level_groups(levels: int, level_bytes: int) -> list[tuple[int, int]]:
     """Return the ranges of levels (first, end) that one launch of the backward lookup takes.
 
     Launches of few levels keep the sums in the L2 cache, where atomics are much faster than in memory. The coarser
-    half of the levels goes together, as little of their tables is used.
-
-    Args:
-        levels: L.
-        level_bytes: of the sums of one level.
+    half of the levels goes together, as little of their tables is used. `level_bytes` are those of a level's sums.
     """
     if levels * level_bytes <= 2 * GROUP_BYTES:
         return [(0, levels)]

@@ -16,15 +16,8 @@ def check_image(
 ) -> None:
     """Raise an error unless an image can be rendered: its pixels and hits are counted in int32, and it takes memory.
 
-    The memory compared is what a rendering holds at once, without its lists of surfels: a lower bound.
-
-    Args:
-        width: image width in pixels.
-        height: image height in pixels.
-        max_hits: K.
-        real: dtype of the surfels.
-        device: of the surfels.
-        texture: number of values that the texture keeps for each hit, 0 without a texture; their dtype.
+    The memory compared is what a rendering holds at once, without its lists of surfels: a lower bound. `texture` has
+    the number of values that the texture keeps for each hit, 0 without a texture, and their dtype.
     """
     image, advice = f"{width}x{height}", "render the image in parts (Camera.crop)"
     padded = -(-width // 16) * 16 * -(-height // 16) * 16

@@ -11,17 +11,11 @@ HALF_GRADIENT = 64.0
 
 @dataclass(frozen=True)
 class Points:
-    """Points at which a texture is evaluated.
+    """Points at which a texture is evaluated."""
 
-    Attributes:
-        positions: (n, 3) world.
-        depths: (n,) z-depths from the camera, world units; a point with depth 0 is skipped and has features 0.
-        focal: (1,) focal length in pixels, for the down-weighting of paper Eq. 4; not differentiated.
-    """
-
-    positions: torch.Tensor
-    depths: torch.Tensor
-    focal: torch.Tensor
+    positions: torch.Tensor  # (n, 3) world
+    depths: torch.Tensor  # (n,) z-depths, world units; a point with depth 0 is skipped and has features 0
+    focal: torch.Tensor  # (1,) focal length in pixels, for the down-weighting of paper Eq. 4; not differentiated
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -29,22 +23,17 @@ class Points:
 
 @dataclass(frozen=True)
 class Field:
-    """A hash grid and an MLP.
+    """A hash grid and an MLP, whose matrices (out, in) have ReLU between them and no biases.
 
-    Attributes:
-        grid: (L, T, F) features, T a power of two, F in 1, 2, 4, 8.
-        weights: the MLP's matrices (out, in), ReLU between them, no biases; 3 (d + 1)^2 outputs for SH degree d.
-        resolutions: (L,) cells per world unit; not differentiated.
-        half: keep features, activations and coefficients in half precision; gradients are scaled on the way and summed
-            in float32.
-        table: (L, T, F) the grid in half precision, where the caller has it already.
+    With `half`, features, activations and coefficients are in half precision; gradients are scaled on the way and
+    summed in float32.
     """
 
-    grid: torch.Tensor
-    weights: Sequence[torch.Tensor]
-    resolutions: torch.Tensor
+    grid: torch.Tensor  # (L, T, F) features, T a power of two, F in 1, 2, 4, 8
+    weights: Sequence[torch.Tensor]  # 3 (d + 1)^2 outputs for SH degree d
+    resolutions: torch.Tensor  # (L,) cells per world unit; not differentiated
     half: bool = False
-    table: torch.Tensor | None = None
+    table: torch.Tensor | None = None  # (L, T, F) the grid in half precision, where the caller has it already
 
     def stored(self) -> torch.Tensor:
         """The grid's values, contiguous, in the precision of the evaluation."""
@@ -57,17 +46,13 @@ class Field:
 class Rays:
     """Directions along which coefficients become colours.
 
-    Attributes:
-        directions: (P, 3) unit directions, world; of n = P * K points, point i belongs to direction i // K.
-        offset: colour of coefficients of 0; 0 makes them residuals.
-        clamp: limit colours to >= 0.
-        image: (height, width), whose product is P, of the image that the directions belong to, row by row; neighbouring
-            pixels then work together. It changes no result but for the order of sums.
+    Those of an image (height, width), whose product is P, are row by row; neighbouring pixels then work together, which
+    changes no result but for the order of sums.
     """
 
-    directions: torch.Tensor
-    offset: float = 0.5
-    clamp: bool = False
+    directions: torch.Tensor  # (P, 3) unit, world; of n = P * K points, point i belongs to direction i // K
+    offset: float = 0.5  # colour of coefficients of 0; 0 makes them residuals
+    clamp: bool = False  # limit colours to >= 0
     image: tuple[int, int] | None = None
 
 

@@ -25,23 +25,11 @@ def photometric_terms(
 ) -> tuple[torch.Tensor | None, torch.Tensor | None, torch.Tensor | None]:
     """Return the L1, texture and alpha terms of `nexwarp.train.losses`, each times its factor.
 
-    Differentiable once, with respect to image, textured and weights. What no wanted term reads may be None.
-
-    Args:
-        image: (H, W, 3) float32 or float64.
-        textured: (H, W, 3), sum_k W T.
-        weights: (H, W, K), W.
-        target: (H, W, 3).
-        l1: factor of the mean of |image - target|.
-        texture: factor of the mean of |textured / (sum_k W + 1e-6) - target|.
-        alpha: factor of the mean of 1 - sum_k W.
-        saturation: a channel of `target` with at least this value equals any brighter one; None compares all values.
-
-    Returns:
-        Three scalars; None, at no cost, for a factor of 0.
-
-    Raises:
-        ValueError: a shape or device does not fit, or `target` requires a gradient, which it would not get.
+    They are the means of |image - target|, of |textured / (sum_k W + 1e-6) - target| and of 1 - sum_k W, with image,
+    textured and target (H, W, 3) and weights W (H, W, K), float32 or float64. Differentiable once, with respect to
+    image, textured and weights; ValueError where `target` requires a gradient. What no wanted term reads may be None;
+    a factor of 0 gives None, at no cost. A channel of `target` with at least the value `saturation` equals any brighter
+    one.
     """
     wanted: dict[str, tuple[torch.Tensor | None, tuple[int | str, ...], float]] = {
         "image": (image, ("H", "W", 3), l1),
@@ -95,18 +83,9 @@ def expose(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return image and textured at an exposure: multiply them, and clip the image where the photo is clipped.
 
-    Where a channel of the photo is saturated, a brighter image equals it: it has no error and no gradient there.
-    Differentiable once, with respect to image and textured.
-
-    Args:
-        image: (H, W, 3) float32 or float64.
-        textured: (H, W, 3), sum_k W T.
-        exposure: (3,) or (H, W, 3) gains times falloff.
-        photo: (H, W, 3).
-        saturation: a channel of `photo` with at least this value is saturated.
-
-    Raises:
-        ValueError: a shape or device does not fit, or `exposure` or `photo` requires a gradient that it would not get.
+    Where a channel of the photo is saturated, at least `saturation`, a brighter image equals it: it has no error and no
+    gradient there. Images are (H, W, 3), float32 or float64, `exposure` (3,) or (H, W, 3). Differentiable once, with
+    respect to image and textured; ValueError where `exposure` or `photo` requires a gradient.
     """
     shape = ("H", "W", 3)
     there = {"image": (image, shape), "textured": (textured, shape), "photo": (photo, shape)}

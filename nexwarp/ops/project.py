@@ -11,33 +11,21 @@ from nexwarp.ops._interop import Context, first_derivative, launch, needed, real
 
 @dataclass(frozen=True)
 class Pinhole:
-    """The image plane that the passes see: a camera without its pose.
+    """The image plane that the passes see: a camera without its pose."""
 
-    Attributes:
-        K: (3, 3) intrinsics in pixels, on the surfels' device and of their dtype; pixel centres lie at +0.5.
-        width, height: pixels.
-        near: hits with a z-depth of at most this (world units) are ignored.
-    """
-
-    K: torch.Tensor
+    K: torch.Tensor  # (3, 3) intrinsics in pixels, on the surfels' device and of their dtype; pixel centres at +0.5
     width: int
     height: int
-    near: float
+    near: float  # hits with a z-depth of at most this (world units) are ignored
 
 
 @dataclass(frozen=True)
 class Projection:
-    """Surfels in the camera's frame, as the walk along a ray reads them.
+    """Surfels in the camera's frame, as the walk along a ray reads them."""
 
-    Attributes:
-        records: (N, 4, 4), see `nexwarp.kernels.surfel`; differentiable.
-        centers: (N, 3) centres in the camera frame, world units; they sort.
-        limits: (N,) what a hit's exponent |u|^(2 g1) + |v|^(2 g2) cannot exceed; only culls.
-    """
-
-    records: torch.Tensor
-    centers: torch.Tensor
-    limits: torch.Tensor
+    records: torch.Tensor  # (N, 4, 4), see `nexwarp.kernels.surfel`; differentiable
+    centers: torch.Tensor  # (N, 3) centres in the camera frame, world units; they sort
+    limits: torch.Tensor  # (N,) what a hit's exponent |u|^(2 g1) + |v|^(2 g2) cannot exceed; only culls
 
 
 def project(
@@ -49,19 +37,10 @@ def project(
     colors: torch.Tensor,
     viewmat: torch.Tensor,
 ) -> Projection:
-    """Project surfels; differentiable with respect to every argument.
+    """Project surfels of plain colours (N, 3) by a world-to-camera matrix (4, 4); differentiable in every argument.
 
-    Args:
-        means: (N, 3) world.
-        quats: (N, 4) wxyz, surfel to world, of any length; one shorter than 1e-12 is divided by 1e-12.
-        scales: (N, 2) world units.
-        opacities: (N,).
-        gammas: (N, 2).
-        colors: (N, 3) plain colours.
-        viewmat: (4, 4) world to camera.
-
-    Raises:
-        TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
+    Quaternions wxyz may have any length; one shorter than 1e-12 is divided by 1e-12. TypeError or ValueError where
+    types, shapes or devices do not fit.
     """
     check_tensors(
         {

@@ -10,20 +10,11 @@ from nexwarp.ops._interop import Context, first_derivative, launch, needed, real
 def plain_colors(
     sh: torch.Tensor | tuple[torch.Tensor, torch.Tensor], means: torch.Tensor, position: torch.Tensor, degree: int
 ) -> torch.Tensor:
-    """Return max(0, 0.5 + SH(direction from the camera to the surfel)); differentiable in every tensor.
+    """Return colours (N, 3), max(0, 0.5 + SH(direction from the camera to the surfel)); differentiable in every tensor.
 
-    Args:
-        sh: (N, C, 3) coefficients, DC first; or sh0 (N, 1, 3) and shN (N, C - 1, 3) apart, which spares a copy. Those
-            above `degree` are not read and get zero gradients.
-        means: (N, 3) world.
-        position: (3,) camera centre, world.
-        degree: 0 to 3, degree to evaluate; less when C is less.
-
-    Returns:
-        (N, 3) colours.
-
-    Raises:
-        TypeError, ValueError: naming the argument, when types, shapes or devices do not fit.
+    `sh` are coefficients (N, C, 3), DC first; or sh0 (N, 1, 3) and shN (N, C - 1, 3) apart, which spares a copy. Those
+    above `degree`, 0 to 3, are not read and get zero gradients. Means (N, 3) and the camera's position (3,) are in the
+    world. TypeError or ValueError where types, shapes or devices do not fit.
     """
     if isinstance(sh, torch.Tensor):
         check_tensors({"sh": (sh, ("N", "C", 3))})

@@ -8,15 +8,9 @@ from nexwarp.ops._interop import Context, first_derivative, launch, real_of
 
 
 def weighted_dssim(image: torch.Tensor, target: torch.Tensor, factor: float = 1.0) -> torch.Tensor:
-    """Return factor * (1 - SSIM), see `nexwarp.train.losses.dssim`; differentiable once, with respect to `image` only.
+    """Return factor * (1 - SSIM) of images (H, W, 3), float32 or float64; differentiable once, in `image` only.
 
-    Args:
-        image: (H, W, 3) float32 or float64.
-        target: (H, W, 3).
-        factor: of the result and of the gradient.
-
-    Raises:
-        ValueError: `target` requires a gradient, which it would not get.
+    ValueError where `target` requires a gradient, which it would not get.
     """
     check_tensors({"image": (image, ("H", "W", 3)), "target": (target, ("H", "W", 3))})
     real_of(image)

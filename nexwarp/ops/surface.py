@@ -15,15 +15,7 @@ from nexwarp.ops.tiles import Tiles
 
 @dataclass(frozen=True)
 class Surface:
-    """Depth and normals; 0 where nothing is hit.
-
-    Attributes:
-        expected_depth: (H, W) mean z-depth of all hits, weighted by their blending weights, world units.
-        median_depth: (H, W) z-depth of the hit that takes the transmittance to 1/2, of the last hit where it stays
-            above.
-        top_depth: (H, W) z-depth of the heaviest hit.
-        normals: (H, W, 3) unit, world frame: mean of the normals, weighted likewise, each towards the camera.
-    """
+    """Depths (H, W) and normals (H, W, 3), those of `nexwarp.Rendering`; 0 where nothing is hit."""
 
     expected_depth: torch.Tensor
     median_depth: torch.Tensor
@@ -33,13 +25,9 @@ class Surface:
 
 @dataclass(frozen=True)
 class DifferentiableSurface(Surface):
-    """A surface with gradients, and what losses of it need.
+    """A surface with gradients, and what losses of it need."""
 
-    Attributes:
-        blended_normals: (H, W, 3) sum of weight * normal, world frame, each normal towards the camera; not normalised.
-    """
-
-    blended_normals: torch.Tensor
+    blended_normals: torch.Tensor  # (H, W, 3), not normalised
 
 
 def surface(
@@ -48,14 +36,8 @@ def surface(
     """Walk every pixel's list once more, for what the K-buffer does not hold.
 
     Differentiable with respect to the projection and `viewmat`. The gradient of the median and of the top depth is that
-    of the depth of the hit that they are taken from: which one it is, is piecewise constant.
-
-    Args:
-        projection: as given to `collect`.
-        tiles: as given to `collect`.
-        hits: as returned by `collect`.
-        camera: as given to `collect`.
-        viewmat: (4, 4) world to camera.
+    of the depth of the hit that they are taken from: which one it is, is piecewise constant. Hits are those of
+    `collect`, whose arguments the others are; `viewmat` (4, 4) is world to camera.
     """
     scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera)
     expected, median, top, sums = walk_surface(projection.records, scene, hits.stops)

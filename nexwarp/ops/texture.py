@@ -38,16 +38,10 @@ def texture(points: Points, field: Field, rays: Rays | None = None, *, fused: bo
 
     Colours whose directions need no gradient are computed by one fused kernel in half precision on GPUs of compute
     capability 8.0 or more, for L * F = 32, F = 2 or 4 and two hidden layers of 64, without torch's deterministic
-    algorithms; all else step by step. The two differ by rounding.
+    algorithms; all else, and all without `fused`, step by step. The two differ by rounding.
 
-    Args:
-        points: the points.
-        field: the texture.
-        rays: directions of the points; None returns coefficients.
-        fused: False computes step by step in any case.
-
-    Returns:
-        (3 (d + 1)^2, n) coefficients, row coefficient * 3 + channel; or (n, 3) colours offset + SH(direction).
+    Return colours (n, 3), offset + SH(direction); or, without rays, coefficients (3 (d + 1)^2, n), whose rows are
+    coefficient * 3 + channel.
     """
     points = replace(points, positions=points.positions.contiguous(), depths=points.depths.contiguous())
     rays = rays and replace(rays, directions=rays.directions.contiguous())

@@ -52,28 +52,19 @@ class ListCapacity:
 class Tiles:
     """Lists of (tile, surfel) entries. Integers, so nothing here is differentiable.
 
-    Attributes:
-        order: (N,) int32, surfels by signed z-depth, or by distance, of their centres (as float32), ties by index.
-        ends: (N,) int32, end of the entries of the surfel order[rank] in emission order.
-        surfel_ids: (M,) int32, surfels by tile, and near to far within a tile.
-        entries: (M,) int32, emission index of each of those; empty unless `exact`.
-        tile_offsets: (tiles + 1,) int32, half-open ranges of `surfel_ids` by tile, row by row.
-        reaches: (N, 2) half the sides of the support rectangle, which |u| and |v| of a hit cannot exceed.
-        columns: tiles in a row.
-        exact: whether the lists hold exactly the entries that there are. Otherwise unused places are at the end; or,
-            where `ends` counts more than M entries, the lists are incomplete and the walk goes over `order`.
-        kind: (tile columns, tile rows): renderings of one kind need about as many entries.
+    They are `exact` where they hold exactly the entries that there are. Otherwise unused places are at the end; or,
+    where `ends` counts more than M entries, the lists are incomplete and the walk goes over `order`.
     """
 
-    order: torch.Tensor
-    ends: torch.Tensor
-    surfel_ids: torch.Tensor
-    entries: torch.Tensor
-    tile_offsets: torch.Tensor
-    reaches: torch.Tensor
-    columns: int
+    order: torch.Tensor  # (N,) int32, surfels by signed z-depth, or distance, of their centres (float32), ties by index
+    ends: torch.Tensor  # (N,) int32, end of the entries of the surfel order[rank] in emission order
+    surfel_ids: torch.Tensor  # (M,) int32, surfels by tile, and near to far within a tile
+    entries: torch.Tensor  # (M,) int32, emission index of each of those; empty unless `exact`
+    tile_offsets: torch.Tensor  # (tiles + 1,) int32, half-open ranges of `surfel_ids` by tile, row by row
+    reaches: torch.Tensor  # (N, 2) half the sides of the support rectangle, which |u| and |v| of a hit cannot exceed
+    columns: int  # tiles in a row
     exact: bool
-    kind: tuple[int, int]
+    kind: tuple[int, int]  # tile columns and rows: renderings of one kind need about as many entries
 
     @property
     def room(self) -> ListCapacity:
@@ -90,17 +81,10 @@ def intersect_tiles(
     blending: Order = "depth",
     room: int | None = None,
 ) -> Tiles:
-    """List, for each tile, the surfels whose support touches it.
+    """List, for each tile, the surfels (means, quats, scales, opacities, gammas) whose support touches it.
 
-    Args:
-        surfels: means (N, 3), world; quats (N, 4), wxyz, surfel to world; scales (N, 2), world units;
-            opacities (N,); gammas (N, 2).
-        projection: of the same surfels.
-        viewmat: (4, 4) world to camera.
-        camera: the image plane.
-        blending: whether `Tiles.order` is by the centres' z-depths or by their distances from the camera.
-        room: number of entries that the lists can hold. By default, on a CPU, the exact number; on CUDA, where the
-            exact number would cost a wait, an upper bound learnt from earlier renderings. Too few is slow but right.
+    `room` is the number of entries that the lists can hold. By default, on a CPU, it is the exact number; on CUDA,
+    where that would cost a wait, an upper bound learnt from earlier renderings. Too few is slow but right.
 
     Raises:
         ValueError, OutOfMemoryError: there are more than MAX_ENTRIES entries, or more than memory holds; on CUDA only

@@ -8,16 +8,10 @@ from nexwarp.ops.project import Pinhole
 
 
 def unproject(depths: torch.Tensor, viewmat: torch.Tensor, camera: Pinhole) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the world points at the given z-depths along the pixels' rays, and the rays' directions.
+    """Return the points (H, W, K, 3) at z-depths (H, W, K) along the pixels' rays, and the rays' directions (H, W, 3).
 
-    Args:
-        depths: (H, W, K) z-depths, world units.
-        viewmat: (4, 4) world to camera.
-        camera: the image plane.
-
-    Returns:
-        (H, W, K, 3) positions, world frame, and (H, W, 3) unit directions, world frame; both
-        differentiable with respect to `depths` and `viewmat`.
+    Points and unit directions are in the world frame, depths in world units; `viewmat` (4, 4) is world to camera. Both
+    are differentiable with respect to `depths` and `viewmat`.
     """
     return _Unproject.apply(depths.contiguous(), viewmat.contiguous(), camera)
 

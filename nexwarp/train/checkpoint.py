@@ -84,9 +84,7 @@ def has_checkpoint(run: Path) -> bool:
 def load_checkpoint(run: Path, warn: Callable[[str], None] = lambda _: None) -> Snapshot:
     """Read the newest whole checkpoint of a run folder; `warn` is told of a damaged one that is passed over.
 
-    Raises:
-        MissingError: there is no checkpoint.
-        CheckpointError: all there are are damaged, or of another version.
+    MissingError where there is none, CheckpointError where all are damaged, or of another version.
     """
     damaged: list[CheckpointError] = []
     for folder in (run / name for name in CHECKPOINTS):

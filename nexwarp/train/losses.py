@@ -54,22 +54,20 @@ def photo_losses(
     empty: torch.Tensor | None = None,
     saturation: float | None = None,
 ) -> dict[str, torch.Tensor]:
-    """Return the terms that compare a rendering with its photo, already multiplied by their factors.
+    """Return the terms "l1", "dssim", "texture" and "alpha" of a rendering and its photo, times their factors.
+
+    A term whose factor is 0 is neither computed nor returned; with K = 0 there is no texture and no alpha term.
 
     Args:
         image: (H, W, 3), the rendering with its background.
         textured: (H, W, 3), sum_k W T.
-        weights: (H, W, K), W; with K = 0 there is no texture and no alpha term.
+        weights: (H, W, K), W.
         target: (H, W, 3), the photograph.
-        factors: of the terms; one whose factor is 0 is neither computed nor returned.
+        factors: of the terms.
         mask: (H, W) bool, True where the photograph counts: elsewhere no term has a gradient, and those of the image
             and the texture are 0. None is True everywhere.
         empty: (H, W) bool, True where `target` is nothing but background: texture and alpha terms do not count there.
         saturation: a channel of `target` with at least this value equals any brighter one in the L1 and texture terms.
-            None compares all values.
-
-    Returns:
-        Term ("l1", "dssim", "texture", "alpha") -> weighted scalar tensor.
     """
     if mask is not None:
         image = torch.where(mask[..., None], image, target)
@@ -114,14 +112,7 @@ def _masked(
 def depth_loss(
     depths: torch.Tensor, weights: torch.Tensor, places: torch.Tensor, expected: torch.Tensor
 ) -> torch.Tensor:
-    """Mean over points of |expected depth of their pixel's hits / their depth - 1|.
-
-    Args:
-        depths: (H, W, K) z-depths of the textured hits, world units.
-        weights: (H, W, K), W.
-        places: (M,) int64, row * W + column of the points' pixels; see `visible_points`.
-        expected: (M,) their z-depths, > 0; what has 0 there is no point, and does not count. 0 without any.
-    """
+    """`depth_map_loss` of points with z-depths `expected` (M,), in pixels `places` (M,) int64, row * W + column."""
     # Not by two indices: on a CPU that adds its gradients, where there are many, by atomics in any order.
     shares, reached = (x.flatten(0, 1).index_select(0, places) for x in (weights, depths))
     return depth_map_loss(reached, shares, expected)
@@ -159,15 +150,10 @@ def normal_loss(out: Rendering, counts: torch.Tensor | None = None) -> torch.Ten
 
 
 def depth_normals(depths: torch.Tensor, viewmat: torch.Tensor, pinhole: ops.Pinhole) -> torch.Tensor:
-    """Return the normals of a depth map by central differences; differentiable with respect to both tensors.
+    """Return the normals (H, W, 3) of a depth map by central differences; differentiable with respect to both tensors.
 
-    Args:
-        depths: (H, W) z-depths, world units; 0 where there is no surface.
-        viewmat: (4, 4) world to camera.
-        pinhole: the image plane.
-
-    Returns:
-        (H, W, 3) unit normals that face the camera, world frame; 0 on the border and beside pixels without a surface.
+    Unit normals, world frame, that face the camera of a viewmat (4, 4); 0 on the border and beside pixels without a
+    surface, whose z-depth (H, W), world units, is 0.
     """
     points = ops.unproject(depths[..., None], viewmat, pinhole)[0][:, :, 0]
     # Relative to the depth, so that the unit of the world does not matter.

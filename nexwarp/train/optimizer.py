@@ -114,16 +114,11 @@ def make_optimizer(
     cells_unit: float = 1.0,
     poses: PoseCorrections | None = None,
 ) -> torch.optim.Optimizer:
-    """Make the optimizer; each of its groups gets the ends of its schedule as `group["ends"]`.
+    """Make the optimizer of surfels, of the texture unless K is 0, and of pose corrections.
 
-    Args:
-        surfels: to train.
-        texture: to train, unless K is 0.
-        config: whose learning rates count.
-        scale: of the scene, world units, which the means' rates follow.
-        make: makes an optimizer of one's own; None makes a `FusedAdam`, which regularises the grid.
-        cells_unit: world units in which the grid's loss counts its cells.
-        poses: pose corrections to train; None trains none.
+    Each of its groups gets the ends of its schedule as `group["ends"]`. The means' rates follow the scene's scale,
+    world units; `cells_unit` are the world units in which the grid's loss counts its cells. `make` makes an optimizer
+    of one's own; None makes a `FusedAdam`, which regularises the grid.
     """
     ends = rate_ends(config, scale)
     parts = {name: [getattr(surfels, name)] for name in PARAMETERS}
