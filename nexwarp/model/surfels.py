@@ -226,15 +226,20 @@ def _flattened(quats: torch.Tensor, log_scales: torch.Tensor) -> tuple[torch.Ten
     # The axes in cyclic order, the smallest one last; and the rotation that puts them there.
     order = torch.tensor([[1, 2], [2, 0], [0, 1]])[smallest]
     turns = torch.tensor([[0.5, 0.5, 0.5, 0.5], [0.5, -0.5, -0.5, -0.5], [1.0, 0.0, 0.0, 0.0]])
-    a, b, c, d = turns[smallest].unbind(-1)
-    w, x, y, z = quats.unbind(-1)
-    turned = [
+    return turned(quats, turns[smallest]), log_scales.gather(1, order)
+
+
+def turned(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
+    """Return the product (N, 4) of quaternions wxyz: the turn of the other one, then of the first."""
+    w, x, y, z = one.unbind(-1)
+    a, b, c, d = other.unbind(-1)
+    product = [
         w * a - x * b - y * c - z * d,
         w * b + x * a + y * d - z * c,
         w * c - x * d + y * a + z * b,
         w * d + x * c - y * b + z * a,
     ]
-    return torch.stack(turned, dim=-1), log_scales.gather(1, order)
+    return torch.stack(product, dim=-1)
 
 
 def check_coefficients(name: str, count: int) -> None:
