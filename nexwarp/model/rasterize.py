@@ -16,6 +16,7 @@ from nexwarp.model.render import check_camera, memory_error, pinhole_of, prepare
 from nexwarp.model.surfels import Activated, check_coefficients
 from nexwarp.model.texture import Hits
 from nexwarp.ops.collect import CHANNELS
+from nexwarp.ops.project import GEOMETRY
 
 Values = torch.Tensor | npt.ArrayLike  # arrays and lists become tensors of the camera's dtype, on its device
 
@@ -110,8 +111,7 @@ def _background(background: Color, like: torch.Tensor, channels: int) -> torch.T
 
 def _check(shape: Activated, colors: torch.Tensor, cameras: Sequence[Camera], max_hits: int) -> None:
     """Check types, shapes, devices and the memory of one image, and get the device ready."""
-    sizes = {"means": ("N", 3), "quats": ("N", 4), "scales": ("N", 2), "opacities": ("N",), "gammas": ("N", 2)}
-    tensors = {name: (x, size) for (name, size), x in zip(sizes.items(), shape, strict=True)}
+    tensors = {name: (x, size) for (name, size), x in zip(GEOMETRY.items(), shape, strict=True)}
     harmonics = isinstance(colors, torch.Tensor) and colors.ndim == 3
     check_tensors({**tensors, "colors": (colors, ("N", "C", 3) if harmonics else ("N", "D"))})
     if harmonics:

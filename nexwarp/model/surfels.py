@@ -14,6 +14,7 @@ from nexwarp.data.ply import read_vertices
 from nexwarp.errors import FormatError, check_each, check_finite, check_tensors
 from nexwarp.kernels.types import MAX_SH_DEGREE
 from nexwarp.model.bounds import check_bounds
+from nexwarp.ops.project import GEOMETRY
 
 COEFFICIENTS = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))  # of SH degrees 0 to 3
 # Distance from the ends of the ranges, where raw values are infinite. Activated values change by at most 2e-6.
@@ -94,19 +95,13 @@ class Surfels(nn.Module):
             torch.from_numpy(x) if isinstance(x, np.ndarray) else x
             for x in (means, quats, scales, opacities, gammas, sh)
         )
-        arguments = {
-            "means": (means, ("N", 3)),
-            "quats": (quats, ("N", 4)),
-            "scales": (scales, ("N", 2)),
-            "opacities": (opacities, ("N",)),
-            "gammas": (gammas, ("N", 2)),
-            "sh": (sh, ("N", "C", 3)),
-        }
-        check_tensors(arguments)
+        shapes = GEOMETRY | {"sh": ("N", "C", 3)}
+        arguments = dict(zip(shapes, (means, quats, scales, opacities, gammas, sh), strict=True))
+        check_tensors({name: (x, shapes[name]) for name, x in arguments.items()})
         if means.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"means: expected float32 or float64, got {means.dtype}")
         check_coefficients("sh", sh.shape[1])
-        for name, (tensor, _) in arguments.items():
+        for name, tensor in arguments.items():
             if tensor.grad_fn is not None and torch.is_grad_enabled():
                 raise ValueError(
                     f"{name}: expected a tensor without a graph, got one of {type(tensor.grad_fn).__name__}; "

@@ -8,6 +8,15 @@ from nexwarp.errors import check_tensors
 from nexwarp.kernels.project import project_kernels
 from nexwarp.ops._interop import Context, first_derivative, launch, needed, real_of
 
+# Shapes of activated surfels, as `errors.check_tensors` takes them.
+GEOMETRY: dict[str, tuple[int | str, ...]] = {
+    "means": ("N", 3),
+    "quats": ("N", 4),
+    "scales": ("N", 2),
+    "opacities": ("N",),
+    "gammas": ("N", 2),
+}
+
 
 @dataclass(frozen=True)
 class Pinhole:
@@ -42,18 +51,9 @@ def project(
     Quaternions wxyz may have any length; one shorter than 1e-12 is divided by 1e-12. TypeError or ValueError where
     types, shapes or devices do not fit.
     """
-    check_tensors(
-        {
-            "means": (means, ("N", 3)),
-            "quats": (quats, ("N", 4)),
-            "scales": (scales, ("N", 2)),
-            "opacities": (opacities, ("N",)),
-            "gammas": (gammas, ("N", 2)),
-            "colors": (colors, ("N", 3)),
-            "viewmat": (viewmat, (4, 4)),
-        }
-    )
     tensors = (means, quats, scales, opacities, gammas, colors, viewmat)
+    shapes = GEOMETRY | {"colors": ("N", 3), "viewmat": (4, 4)}
+    check_tensors({name: (x, shape) for (name, shape), x in zip(shapes.items(), tensors, strict=True)})
     return Projection(*_Project.apply(*(x.contiguous() for x in tensors)))
 
 
