@@ -6,11 +6,13 @@ from typing import Any
 import torch
 
 import nexwarp as nw
+from nexwarp import ops
+from nexwarp.model.exposures import Exposures
 from nexwarp.model.render import draw as draw_parts
-from tests.narrowing import present
+from tests.narrowing import present, total
 from tests.reference import render as reference
 from tests.reference.collect import Shape, View
-from tests.scenes import Scene, make_camera, make_surfels
+from tests.scenes import Scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
 BUFFERS = ("image", "plain", "textured", "depths", "weights", "alpha")
@@ -49,6 +51,68 @@ def loss(out: Any) -> torch.Tensor:
         factors = torch.randn(buffer.shape, generator=generator, dtype=torch.float64)
         total = total + (buffer * factors.to(buffer)).sum()
     return total
+
+
+def leaf(tensor: torch.Tensor) -> torch.Tensor:
+    return tensor.detach().clone().requires_grad_()
+
+
+class Passes:
+    """The passes of one rendering, their inputs being leaves: project -> tiles -> collect and surface, then a loss.
+
+    `room` is that of the tile lists.
+    """
+
+    def __init__(self, scene: Scene, *, max_hits: int = 2, room: int | None = None) -> None:
+        surfels, camera = make_surfels(scene), make_camera(scene)
+        viewmat = leaf(camera.viewmat)
+        means, quats, scales = leaf(surfels.means), leaf(surfels.quats), leaf(surfels.scales)
+        shape = (means, quats, scales, leaf(surfels.opacities), leaf(surfels.gammas))
+        self.pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
+        sh = leaf(surfels.sh)
+        self.colors = ops.plain_colors(sh, shape[0], -viewmat[:3, :3].T @ viewmat[:3, 3], 3)
+        self.projection = ops.project(*shape, self.colors, viewmat)
+        self.tiles = ops.intersect_tiles(shape, self.projection, viewmat, self.pinhole, room=room)
+        self.hits = ops.collect(self.projection, self.tiles, self.pinhole, max_hits=max_hits)
+        names = ("means", "quats", "scales", "opacities", "gammas", "sh", "viewmat")
+        self.leaves = dict(zip(names, (*shape, sh, viewmat), strict=True))
+
+    def buffers(self) -> dict[str, torch.Tensor]:
+        names = ("plain", "base", "ids", "depths", "weights", "alpha")
+        return {name: getattr(self.hits, name).detach() for name in names}
+
+    def gradients(self) -> dict[str, torch.Tensor]:
+        """Of the sum of all differentiable buffers with fixed random factors."""
+        generator, hits = torch.Generator().manual_seed(2), self.hits
+        surface = ops.surface(self.projection, self.tiles, hits, self.pinhole, self.leaves["viewmat"])
+        depths = surface.expected_depth, surface.median_depth, surface.top_depth
+        buffers = (hits.plain, hits.base, hits.depths, hits.weights, hits.alpha, *depths, surface.blended_normals)
+        factors = (torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x) for x in buffers)
+        total((x * factor).sum() for x, factor in zip(buffers, factors, strict=True)).backward()
+        return {name: present(leaf.grad) for name, leaf in self.leaves.items()}
+
+    def blended(self, errors: torch.Tensor) -> torch.Tensor:
+        return ops.splat_error(self.projection, self.tiles, self.hits, self.pinhole, errors).detach()
+
+
+def cameras(device: torch.device | str, count: int = 4, width: int = 61, height: int = 45) -> list[nw.Camera]:
+    """Cameras that move back and turn, each with a focal length and a principal point of its own."""
+    found = []
+    for i in range(count):
+        viewmat = torch.eye(4)
+        viewmat[2, 3], viewmat[0, 3] = 0.3 * i, 0.1 * i
+        K = torch.tensor([[50.0 + 3 * i, 0.0, 30.0 - i], [0.0, 52.0 + i, 22.0 + i], [0.0, 0.0, 1.0]])
+        found.append(nw.Camera(viewmat, K, width, height).to(device))
+    return found
+
+
+def finished(device: torch.device | str, seed: int = 0) -> nw.Model:
+    """A model with texture, exposures of a lens with vignetting, and detail limits."""
+    scene = random_scene(80, device=device, seed=seed)
+    gains = 0.2 * torch.randn(4, 3, generator=torch.Generator().manual_seed(seed))
+    exposures = Exposures.of(gains, cameras("cpu"), (-0.2, -0.1, 0.5)).to(device)
+    limits = nw.DetailLimits(torch.full((80,), 0.01), torch.full((80,), 0.05)).to(device)
+    return nw.Model(make_surfels(scene), make_texture(device=device), exposures, limits)
 
 
 def view_of(camera: nw.Camera, order: str = "depth") -> View:

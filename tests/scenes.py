@@ -110,6 +110,32 @@ def layered_scene(
     return finish(scene, dtype, device)
 
 
+def facing_scene(
+    *surfels: tuple[float, float],
+    scale: float = 100.0,
+    gamma: float = 1.0,
+    size: tuple[int, int],
+    focal: float = 24.0,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Scene:
+    """Make surfels (z-depth, opacity) on the axis of a camera at the origin, which they face."""
+    count, (width, height) = len(surfels), size
+    z, opacities = torch.tensor(surfels, dtype=torch.float64).unbind(-1)
+    scene: Scene = {
+        "means": torch.stack([0 * z, 0 * z, z], dim=-1),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        "scales": torch.full((count, 2), scale),
+        "opacities": opacities,
+        "gammas": torch.full((count, 2), gamma),
+        "sh": random_scene(count)["sh"],
+        "viewmat": torch.eye(4),
+        "K": intrinsics(focal, focal, width / 2, height / 2),
+    }
+    moved = {name: x.to(device=device, dtype=dtype) for name, x in scene.items()}
+    return moved | {"width": width, "height": height, "near": 0.01}
+
+
 def named_scene(name: str, dtype: torch.dtype, device: torch.device | str) -> Scene:
     """Make one of the scenes on which renderings are compared: random, off_centre, specks, near, layered, wide."""
     if name == "layered":

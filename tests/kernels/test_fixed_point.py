@@ -11,9 +11,9 @@ import warp as wp
 import nexwarp as nw
 from nexwarp.native.fixed_point import LARGEST
 from nexwarp.ops._interop import from_fixed_point
-from tests.narrowing import present
-from tests.ops.test_threads import Passes, errors_of
-from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.ops.test_threads import errors_of
+from tests.render_support import Passes
+from tests.scenes import random_scene
 from tests.tolerances import assert_close
 from tests.warp_kernels import add_in_order
 
@@ -91,24 +91,3 @@ def test_lookup_in_fixed_point(features: int, switched: Callable[[bool], None]) 
         results.append(torch.autograd.grad((out * factors).sum(), [leaf, *texture.parameters()]))
     for index, (plain, fixed_) in enumerate(zip(*results, strict=True)):
         assert_close(fixed_, plain, kind="gradient", name=f"gradient {index}")
-
-
-@pytest.mark.cuda
-def test_gradients_repeat_bit_for_bit() -> None:
-    """Thousands of overlapping surfels, half precision: with torch's deterministic algorithms all bits repeat."""
-    device = torch.device("cuda")
-    scene = random_scene(4000, width=400, height=300, device=device)
-    surfels, texture, camera = make_surfels(scene), make_texture(device=device, residual=True), make_camera(scene)
-    found = []
-    torch.use_deterministic_algorithms(True)
-    try:
-        for _ in range(5):
-            out = nw.render(surfels, texture, camera)
-            request = out.request_splat_error(out.alpha.detach())
-            parameters = [*surfels.parameters(), *texture.parameters()]
-            grads = torch.autograd.grad(out.image.square().sum() + out.weights.square().sum(), parameters)
-            found.append([*grads, present(request.sums_after_backward), out.splat_error(out.alpha.detach())])
-    finally:
-        torch.use_deterministic_algorithms(False)
-    for other in found[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))

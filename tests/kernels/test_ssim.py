@@ -4,8 +4,6 @@ import pytest
 import torch
 
 from nexwarp.ops.ssim import weighted_dssim
-from nexwarp.train.losses import photo_losses
-from nexwarp.train.recipe import LossWeights
 from tests.reference import losses as reference
 from tests.tolerances import assert_close
 
@@ -68,13 +66,3 @@ def test_what_is_not_finite_shows_and_stays_near(device: torch.device, bad: floa
     wrong = ~gradient.isfinite()
     assert wrong[12:33, 5:26, 1].all()
     assert int(wrong.sum()) == 21 * 21
-
-
-def test_photo_losses_fold_the_factor_in() -> None:
-    image, target = images(9, 9)
-    nothing = torch.zeros_like(target), target.new_zeros(9, 9, 0)
-    terms = photo_losses(image, *nothing, target, LossWeights(dssim=0.3))
-    expected = 0.3 * reference.dssim(image, target)
-    assert_close(terms["dssim"], expected, kind="value", name="dssim")
-    actual, wanted = (torch.autograd.grad(x, image)[0] for x in (terms["dssim"], expected))
-    assert_close(actual, wanted, kind="gradient", name="gradient")

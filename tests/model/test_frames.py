@@ -14,36 +14,13 @@ import nexwarp as nw
 from nexwarp.cameras.camera import StagedCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.model import graphs as frames
-from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import RenderChanges
 from nexwarp.model.render import Rendering, draw
 from tests.narrowing import neural, present
-from tests.render_support import BUFFERS, assert_same
-from tests.scenes import make_surfels, make_texture, random_scene
+from tests.render_support import BUFFERS, assert_same, cameras, finished
 
-COUNT = 80
 LATER = ("expected_depth", "median_depth", "top_depth", "normals", "colors")
 CUDA = pytest.mark.cuda
-
-
-def cameras(device: torch.device | str, count: int = 4, width: int = 61, height: int = 45) -> list[nw.Camera]:
-    """Cameras that move back and turn, each with a focal length and a principal point of its own."""
-    found = []
-    for i in range(count):
-        viewmat = torch.eye(4)
-        viewmat[2, 3], viewmat[0, 3] = 0.3 * i, 0.1 * i
-        K = torch.tensor([[50.0 + 3 * i, 0.0, 30.0 - i], [0.0, 52.0 + i, 22.0 + i], [0.0, 0.0, 1.0]])
-        found.append(nw.Camera(viewmat, K, width, height).to(device))
-    return found
-
-
-def finished(device: torch.device | str, seed: int = 0) -> nw.Model:
-    """A model with texture, exposures of a lens with vignetting, and detail limits."""
-    scene = random_scene(COUNT, device=device, seed=seed)
-    gains = 0.2 * torch.randn(4, 3, generator=torch.Generator().manual_seed(seed))
-    exposures = Exposures.of(gains, cameras("cpu"), (-0.2, -0.1, 0.5)).to(device)
-    limits = nw.DetailLimits(torch.full((COUNT,), 0.01), torch.full((COUNT,), 0.05)).to(device)
-    return nw.Model(make_surfels(scene), make_texture(device=device), exposures, limits)
 
 
 def both(model: nw.Model, camera: nw.Camera, **options: Any) -> tuple[Rendering, Rendering]:

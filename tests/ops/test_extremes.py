@@ -10,11 +10,20 @@ from nexwarp import ops
 from nexwarp.kernels.tiles import LARGEST_INT, MAX_ENTRIES
 from nexwarp.native.warp import tile_size_on
 from tests.narrowing import present
-from tests.scenes import SURFEL_KEYS, Scene, detached_shape, make_camera, make_surfels, make_texture, random_scene
+from tests.ops.test_laws import awkward_scene
+from tests.render_support import BACKGROUND, BUFFERS
+from tests.scenes import (
+    SURFEL_KEYS,
+    Scene,
+    detached_shape,
+    facing_scene,
+    make_camera,
+    make_surfels,
+    make_texture,
+    random_scene,
+)
 from tests.tolerances import assert_close, assert_finite
 
-BUFFERS = ("image", "plain", "textured", "depths", "weights", "alpha")
-BACKGROUND = (0.1, 0.4, 0.7)
 SIDE = 8192
 REFUSED = r"^surfels: expected at most 1,073,741,823 \(tile, surfel\) entries, got "
 
@@ -31,9 +40,7 @@ def scene_with(device: torch.device, count: int = 24, **values: Any) -> Scene:
 
 def facing(device: torch.device, **values: Any) -> Scene:
     """One surfel four units before the camera, its axes along the image's; 16 x 16 pixels, a unit is 8 of them."""
-    scene = scene_with(device, 1, means=(0.0, 0.0, 4.0), quats=(1.0, 0.0, 0.0, 0.0), scales=0.5, opacities=0.9)
-    K = torch.tensor([[32.0, 0.0, 8.0], [0.0, 32.0, 8.0], [0.0, 0.0, 1.0]], device=device)
-    scene |= {"viewmat": torch.eye(4, device=device), "K": K}
+    scene = facing_scene((4.0, 0.9), scale=0.5, size=(16, 16), focal=32.0, device=device)
     for name, value in values.items():
         scene[name] = torch.as_tensor(value, device=device).expand_as(scene[name]).clone()
     return scene
@@ -56,7 +63,7 @@ def check_finite(scene: Scene, raw: dict[str, float] | None = None, **options: A
     settings: dict[str, Any] = {"max_hits": 4, "background": BACKGROUND} | options
     out = nw.render(surfels, texture, camera, **settings)
     total = out.image.new_zeros(())
-    for name in BUFFERS:
+    for name in (*BUFFERS, "expected_depth", "median_depth", "top_depth", "normals"):
         assert_finite(getattr(out, name), name)
         total = total + (getattr(out, name) * torch.randn_like(getattr(out, name))).sum()
     total.backward()
@@ -95,6 +102,11 @@ def test_huge_worlds_are_finite(factor: float, device: torch.device) -> None:
     scene = scene_with(device)
     check_finite(scene | {"means": factor * scene["means"]})
     check_finite(scene | {"means": factor * scene["means"], "scales": factor * scene["scales"]})
+
+
+@pytest.mark.parametrize("near", [0.0, 0.01])
+def test_awkward_surfels_are_finite(near: float, device: torch.device) -> None:
+    check_finite(awkward_scene(device) | {"near": near})
 
 
 @pytest.mark.parametrize("near", [0.0, 0.01])

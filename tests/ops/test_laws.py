@@ -9,16 +9,15 @@ from tests.render_support import (
     BUFFERS,
     MAX_HITS,
     assert_alike,
-    assert_gradients,
     assert_same,
     draw,
-    loss,
     reference_render,
     twin,
 )
 from tests.scenes import (
     SURFEL_KEYS,
     Scene,
+    facing_scene,
     layered_scene,
     make_camera,
     make_surfels,
@@ -26,7 +25,7 @@ from tests.scenes import (
     moved_scene,
     random_scene,
 )
-from tests.tolerances import assert_close, assert_finite, assert_same_ids
+from tests.tolerances import assert_close, assert_same_ids
 
 
 def test_repeated_renders_are_identical(device: torch.device) -> None:
@@ -78,29 +77,6 @@ def test_without_texture_max_hits_does_not_matter(device: torch.device) -> None:
 
 
 @pytest.mark.parametrize("textured", [False, True])
-def test_with_room_for_all_hits_nothing_stays_plain(textured: bool, device: torch.device) -> None:
-    scene = random_scene(MAX_HITS, device=device)
-    scene["opacities"] *= 0.8
-    texture = make_texture(device=device) if textured else None
-    out = draw(scene, texture, max_hits=MAX_HITS)
-    assert not out.plain.any()
-    assert_close(out.weights.sum(-1), out.alpha, kind="value", name="sum of the weights")
-
-
-def test_buffers_follow_their_definition(device: torch.device) -> None:
-    scene = random_scene(device=device)
-    out = draw(scene, make_texture(device=device), max_hits=4)
-    empty = out.ids < 0
-    assert empty.any() and not empty.all()
-    assert (out.ids[empty] == -1).all() and not out.weights[empty].any() and not out.depths[empty].any()
-    assert (out.weights[~empty] > 0).all() and (out.depths[~empty] > scene["near"]).all()
-    assert (out.weights[..., 1:] <= out.weights[..., :-1]).all()
-    assert out.ids.dtype == torch.int32 and out.image.dtype == torch.float32
-    behind = (1 - out.alpha)[..., None] * torch.tensor(BACKGROUND, device=device)
-    assert_close(out.image, out.plain + out.textured + behind, kind="value", name="image")
-
-
-@pytest.mark.parametrize("textured", [False, True])
 def test_a_crop_is_a_camera_with_another_centre(textured: bool, device: torch.device) -> None:
     """To the last bit: no result may depend on where a pixel lies in its tile or a tile in the image."""
     scene = random_scene(width=50, height=41, device=device)
@@ -149,23 +125,6 @@ def awkward_scene(device: torch.device, dtype: torch.dtype = torch.float32) -> S
     return {key: value.to(device) if isinstance(value, torch.Tensor) else value for key, value in scene.items()}
 
 
-@pytest.mark.parametrize("near", [0.0, 0.01])
-def test_awkward_surfels_stay_finite(near: float, device: torch.device) -> None:
-    scene = awkward_scene(device)
-    surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene, near=near)
-    out = nw.render(surfels, texture, camera, max_hits=4)
-    for name in BUFFERS:
-        assert_finite(getattr(out, name), name)
-    surface = out.expected_depth.sum() + out.median_depth.sum() + out.top_depth.sum() + out.normals.sum()
-    (loss(out) + surface).backward()
-    gradients = {"viewmat": camera.viewmat.grad}
-    for module in (surfels, texture):
-        gradients |= {name: parameter.grad for name, parameter in module.named_parameters()}
-    for name, gradient in gradients.items():
-        assert gradient is not None, name
-        assert_finite(gradient, name)
-
-
 def test_awkward_surfels_agree_with_the_reference(device: torch.device) -> None:
     """Surfels that cross the near plane are clipped by it, never dropped.
 
@@ -180,29 +139,6 @@ def test_awkward_surfels_agree_with_the_reference(device: torch.device) -> None:
     assert_alike(out, expected)
 
 
-@pytest.mark.parametrize("textured", [False, True])
-def test_surfels_nearer_than_the_near_plane_count_neither_forward_nor_backward(
-    textured: bool, device: torch.device
-) -> None:
-    """The plane goes through the scene: surfels lie wholly before it, across it and behind it."""
-    scene = random_scene(40, width=36, height=28, dtype=torch.float64, device=device)
-    texture = make_texture(dtype=torch.float64, device=device) if textured else None
-    surfels, camera = make_surfels(scene), make_camera(scene, near=3.0)
-    expected_surfels, expected_texture = twin(surfels), twin(texture)
-    out = nw.render(surfels, texture, camera, max_hits=2)
-    expected_camera = make_camera(scene, near=3.0).to("cpu")
-    expected = reference_render(expected_surfels, expected_texture, expected_camera, max_hits=2)
-    loss(out).backward()
-    loss(expected).backward()
-    everything = nw.render(surfels, texture, make_camera(scene), max_hits=2)
-    assert (out.ids != everything.ids).double().mean() > 0.2
-    assert_same_ids(out.ids, expected.ids, name="ids")
-    assert_alike(out, expected)
-    assert_gradients(surfels, expected_surfels, torch.float64)
-    if texture is not None:
-        assert_gradients(texture, expected_texture, torch.float64)
-
-
 @pytest.mark.parametrize("max_hits", [0, 1, 2, 3, 5, 8])
 def test_every_buffer_size(max_hits: int, device: torch.device) -> None:
     """The K heaviest are the first K of the eight heaviest."""
@@ -213,35 +149,10 @@ def test_every_buffer_size(max_hits: int, device: torch.device) -> None:
         assert_close(getattr(out, name), getattr(most, name)[..., :max_hits], kind="value", name=name)
 
 
-@pytest.mark.parametrize("coefficients", [1, 4, 9])
-def test_surfels_of_lower_degree(coefficients: int, device: torch.device) -> None:
-    scene = random_scene(device=device)
-    padded = scene["sh"].clone()
-    padded[:, coefficients:] = 0
-    short, full = draw(scene | {"sh": scene["sh"][:, :coefficients]}), draw(scene | {"sh": padded})
-    for buffer in BUFFERS:
-        assert_close(getattr(short, buffer), getattr(full, buffer), kind="value", name=buffer)
-
-
 def in_a_row(device: torch.device, opacities: list[float], scale: float = 100.0, depth: float = 1.0) -> Scene:
-    """Surfels facing the camera one behind the other, one unit apart."""
-    count = len(opacities)
-    scene = random_scene(count, device=device)
-    means = torch.zeros(count, 3, device=device)
-    means[:, 2] = depth + torch.arange(count, device=device)
-    quats = torch.zeros(count, 4, device=device)
-    quats[:, 0] = 1
-    return scene | {
-        "means": means,
-        "quats": quats,
-        "scales": torch.full((count, 2), scale, device=device),
-        "opacities": torch.tensor(opacities, device=device),
-        "gammas": torch.ones(count, 2, device=device),
-        "viewmat": torch.eye(4, device=device),
-        "K": torch.tensor([[10.0, 0.0, 0.5], [0.0, 10.0, 0.5], [0.0, 0.0, 1.0]], device=device),
-        "width": 1,
-        "height": 1,
-    }
+    """Surfels facing a camera of one pixel, one behind the other, one unit apart."""
+    surfels = ((depth + index, opacity) for index, opacity in enumerate(opacities))
+    return facing_scene(*surfels, scale=scale, size=(1, 1), focal=10.0, device=device)
 
 
 def test_of_equal_weights_the_nearer_stays_when_a_heavier_one_comes(device: torch.device) -> None:

@@ -8,7 +8,7 @@ import torch
 import nexwarp as nw
 from nexwarp.machine import deterministic
 from nexwarp.model.render import jitter_factors
-from tests.render_support import MAX_HITS, assert_alike, assert_same, draw, reference_render, twin
+from tests.render_support import MAX_HITS, assert_alike, assert_same, draw
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
@@ -68,15 +68,6 @@ def test_jitter_moves_lookups_along_their_rays(
     assert not torch.equal(draw(scene, texture, jitter=other).textured, moved.textured)
     with pytest.raises(ValueError, match=r"^jitter: expected shape"):
         draw(scene, texture, jitter=torch.ones(2, 3, dtype=factors.dtype, device=device))
-
-
-@pytest.mark.parametrize("sh_degree", [0, 1, 2])
-def test_a_texture_of_lower_degree(sh_degree: int, device: torch.device) -> None:
-    scene = random_scene(dtype=torch.float64, device=device)
-    texture = make_texture(sh_degree=sh_degree, dtype=torch.float64, device=device)
-    surfels, camera = make_surfels(scene), make_camera(scene)
-    out = nw.render(surfels, texture, camera)
-    assert_alike(out, reference_render(twin(surfels), twin(texture), camera.to("cpu")))
 
 
 def test_pictures_without_textured_hits_have_gradients(device: torch.device) -> None:

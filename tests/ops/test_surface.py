@@ -13,6 +13,7 @@ from tests.render_support import view_of
 from tests.scenes import (
     Scene,
     detached_shape,
+    facing_scene,
     layered_scene,
     make_camera,
     make_surfels,
@@ -32,18 +33,8 @@ def draw(scene: Scene, **options: Any) -> nw.Rendering:
 
 def facing_quads(*quads: tuple[float, float], device: torch.device, turned: bool = False) -> Scene:
     """Quads (depth, opacity) wider than the image that face the camera; turned ones show their back."""
-    count = len(quads)
-    scene = random_scene(count, width=12, height=9, dtype=torch.float64, device=device)
-    z, opacities = torch.tensor(quads, dtype=torch.float64, device=device).unbind(-1)
-    quat = [0.0, 1.0, 0.0, 0.0] if turned else [1.0, 0.0, 0.0, 0.0]
-    return scene | {
-        "means": torch.stack([0 * z, 0 * z, z], dim=-1),
-        "quats": torch.tensor(quat, dtype=torch.float64, device=device).expand(count, 4).clone(),
-        "scales": torch.full((count, 2), 100.0, dtype=torch.float64, device=device),
-        "opacities": opacities,
-        "gammas": torch.full((count, 2), 50.0, dtype=torch.float64, device=device),
-        "viewmat": torch.eye(4, dtype=torch.float64, device=device),
-    }
+    scene = facing_scene(*quads, gamma=50.0, size=(12, 9), dtype=torch.float64, device=device)
+    return scene | {"quats": scene["quats"].roll(1, dims=1)} if turned else scene
 
 
 def assert_everywhere(buffer: torch.Tensor, value: float | list[float], name: str) -> None:

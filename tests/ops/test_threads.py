@@ -4,59 +4,21 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import ops
 from nexwarp.kernels import launch
 from nexwarp.train.losses import depth_loss
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
-from tests.narrowing import present, total
+from tests.narrowing import present
+from tests.render_support import Passes, leaf
 from tests.scene_writers import write_demo
-from tests.scenes import Scene, layered_scene, make_camera, make_surfels, make_texture, random_scene
+from tests.scenes import Scene, layered_scene, make_texture, random_scene
 from tests.tolerances import assert_close
 
 pytestmark = pytest.mark.usefixtures("restore_launch_threads")
 
-BUFFERS = ("plain", "base", "ids", "depths", "weights", "alpha")
 BIG = {"width": 61, "height": 45}
 # 19 x 13 tiles: a sixteenth of their pixels is no whole number of tiles, which once split a tile between two threads.
 WIDE = {"width": 300, "height": 200}
-
-
-def leaf(tensor: torch.Tensor) -> torch.Tensor:
-    return tensor.detach().clone().requires_grad_()
-
-
-class Passes:
-    """The passes of one rendering, their inputs being leaves: project -> tiles -> collect, then a fixed random loss."""
-
-    def __init__(self, scene: Scene, *, max_hits: int = 2) -> None:
-        surfels, camera = make_surfels(scene), make_camera(scene)
-        viewmat = leaf(camera.viewmat)
-        means, quats, scales = leaf(surfels.means), leaf(surfels.quats), leaf(surfels.scales)
-        shape = (means, quats, scales, leaf(surfels.opacities), leaf(surfels.gammas))
-        self.pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
-        sh = leaf(surfels.sh)
-        self.colors = ops.plain_colors(sh, shape[0], -viewmat[:3, :3].T @ viewmat[:3, 3], 3)
-        self.projection = ops.project(*shape, self.colors, viewmat)
-        self.tiles = ops.intersect_tiles(shape, self.projection, viewmat, self.pinhole)
-        self.hits = ops.collect(self.projection, self.tiles, self.pinhole, max_hits=max_hits)
-        names = ("means", "quats", "scales", "opacities", "gammas", "sh", "viewmat")
-        self.leaves = dict(zip(names, (*shape, sh, viewmat), strict=True))
-
-    def buffers(self) -> dict[str, torch.Tensor]:
-        return {name: getattr(self.hits, name).detach() for name in BUFFERS}
-
-    def gradients(self) -> dict[str, torch.Tensor]:
-        generator = torch.Generator().manual_seed(2)
-        loss = total(
-            (x * torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x)).sum()
-            for x in (self.hits.plain, self.hits.base, self.hits.depths, self.hits.weights, self.hits.alpha)
-        )
-        loss.backward()
-        return {name: present(leaf.grad) for name, leaf in self.leaves.items()}
-
-    def blended(self, errors: torch.Tensor) -> torch.Tensor:
-        return ops.splat_error(self.projection, self.tiles, self.hits, self.pinhole, errors).detach()
 
 
 def errors_of(scene: Scene, dtype: torch.dtype = torch.float32) -> torch.Tensor:

@@ -2,7 +2,6 @@
 
 import copy
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 import torch
@@ -12,11 +11,9 @@ import nexwarp as nw
 from nexwarp.kernels import launch
 from nexwarp.machine import deterministic
 from nexwarp.model.buffers import PASSES, render_buffers
-from nexwarp.model.exposures import Exposures
 from nexwarp.train.trainer import Trainer
-from tests.narrowing import present
-from tests.render_support import BACKGROUND, BUFFERS, assert_same, loss
-from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.narrowing import neural, present
+from tests.render_support import BACKGROUND, BUFFERS, assert_same, cameras, finished, loss
 from tests.tolerances import assert_close
 from tests.trainer_support import assert_same_state, small
 
@@ -31,21 +28,11 @@ def fixed_order(device: torch.device) -> Iterator[None]:
         yield
 
 
-def model_of(device: torch.device, *, finished: bool = True) -> tuple[nw.Model, nw.Camera]:
-    """A model with texture, exposures with vignetting and detail limits; and a camera."""
-    scene = random_scene(60, device=device, width=61, height=45)
-    surfels, camera = make_surfels(scene), make_camera(scene)
-    if not finished:
-        return nw.Model(surfels, make_texture(device=device)), camera
-    cameras = [camera.to("cpu"), nw.Camera(torch.eye(4), camera.K.cpu(), camera.width, camera.height)]
-    exposures = Exposures.of(torch.tensor([[0.1, 0.0, -0.1], [0.0, 0.2, 0.1]]), cameras, (-0.2, -0.1, 0.5)).to(device)
-    limits = nw.DetailLimits(torch.full((60,), 0.01, device=device), torch.full((60,), 0.05, device=device))
-    return nw.Model(surfels, make_texture(device=device), exposures, limits), camera
-
-
-def texture_of(model: nw.Model) -> nw.NeuralTexture:
-    assert isinstance(model.texture, nw.NeuralTexture)
-    return model.texture
+def model_of(device: torch.device, *, bare: bool = False) -> tuple[nw.Model, nw.Camera]:
+    """A model with texture, exposures with vignetting and detail limits; and a camera that wants a gradient."""
+    model, camera = finished(device), cameras(device, 1)[0]
+    camera.viewmat.requires_grad_()
+    return nw.Model(model.surfels, model.texture) if bare else model, camera
 
 
 def gradients(model: nw.Model, camera: nw.Camera) -> dict[str, torch.Tensor]:
@@ -102,12 +89,12 @@ def test_inference_mode_leaves_nothing_to_a_later_training(device):
 
 
 @pytest.mark.parametrize("dtype", HALVES)
-@pytest.mark.parametrize("finished", [False, True], ids=["bare", "finished"])
-def test_autocast_changes_nothing(dtype, finished, device):
+@pytest.mark.parametrize("bare", [False, True])
+def test_autocast_changes_nothing(dtype, bare, device):
     """The backward pass inside of the region, too: on CUDA, torch differentiates the camera's matrix in half there."""
-    model, camera = model_of(device, finished=finished)
+    model, camera = model_of(device, bare=bare)
     for half in (True, False):
-        texture_of(model).half_precision = half  # of the MLP on CUDA
+        neural(model.texture).half_precision = half  # of the MLP on CUDA
         expected, wanted = model.render(camera, background=BACKGROUND), gradients(model, camera)
         with torch.autocast(device.type, dtype=dtype):
             out = model.render(camera, background=BACKGROUND)
@@ -142,7 +129,7 @@ def test_parameters_in_half_precision_are_refused(dtype, device):
     with pytest.raises(TypeError, match=f"^surfels: expected float32 or float64 .*, got {dtype}"):
         copy.deepcopy(model).to(dtype).render(camera)
     with pytest.raises(TypeError, match=f"^texture.grid: expected dtype torch.float32, got {dtype}"):
-        nw.render(model.surfels, copy.deepcopy(texture_of(model)).to(dtype), camera)
+        nw.render(model.surfels, copy.deepcopy(neural(model.texture)).to(dtype), camera)
 
 
 # Transforms: the table of docs/python.md, row by row
@@ -151,18 +138,17 @@ def test_parameters_in_half_precision_are_refused(dtype, device):
 def drawings(device: torch.device) -> tuple[dict[str, Callable[[torch.Tensor], torch.Tensor]], torch.Tensor]:
     """Sums of renderings in the three ways of asking for one, as functions of a plain tensor; and such a tensor."""
     model, camera = model_of(device)
-    scene: dict[str, Any] = random_scene(60, device=device, width=61, height=45)
-    shape = {name: scene[name] for name in ("quats", "scales", "opacities", "gammas")}
+    means, quats, scales, opacities, gammas = (x.detach() for x in model.surfels.activated())
 
     def rasterized(means: torch.Tensor) -> torch.Tensor:
-        hits = nw.rasterize(means, **shape, colors=means.cos(), camera=camera)
+        hits = nw.rasterize(means, quats, scales, opacities, gammas, means.cos(), camera)
         return nw.compose(hits, hits.points.sin(), 0.5).square().mean()
 
     return {
         "render": lambda x: (nw.render(model.surfels, model.texture, camera).image * x.cos().mean()).square().mean(),
         "model": lambda x: (model.render(camera).image * x.cos().mean()).square().mean(),
         "rasterize": rasterized,
-    }, scene["means"].requires_grad_()
+    }, means.requires_grad_()
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")  # torch's own, of its guards
@@ -180,10 +166,10 @@ def test_compiled_code_calls_a_rendering_as_it_is(name, device):
 
 def test_second_derivatives_raise(device):
     """Of every parameter, whether all gradients or one alone are asked for; never a constant without a word."""
-    model, camera = model_of(device, finished=False)
-    for x in (*model.surfels.parameters(), texture_of(model).grid, camera.viewmat):
+    model, camera = model_of(device, bare=True)
+    for x in (*model.surfels.parameters(), neural(model.texture).grid, camera.viewmat):
         out = model.render(camera)
-        total = out.image.sum() if x is texture_of(model).grid else out.image.sum() + out.expected_depth.sum()
+        total = out.image.sum() if x is neural(model.texture).grid else out.image.sum() + out.expected_depth.sum()
         (grad,) = torch.autograd.grad(total, x, create_graph=True)
         with pytest.raises(RuntimeError, match=SECOND):
             torch.autograd.grad(grad.sum(), x, retain_graph=True)

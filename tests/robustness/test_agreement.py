@@ -88,6 +88,7 @@ def test_render_agrees_with_the_reference(
     loss(out).backward()
     loss(expected).backward()
 
+    assert out.ids.dtype == torch.int32 and out.image.dtype == dtype
     assert_same_ids(out.ids, expected.ids, name="ids", allow_flips=flips)
     for buffer in BUFFERS:
         mine, theirs = getattr(out, buffer), getattr(expected, buffer)
