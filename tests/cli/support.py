@@ -10,14 +10,10 @@ import torch
 from PIL import Image
 
 from nexwarp.cli import main as cli
-from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
+from nexwarp.train.recipe import Config
+from tests.trainer_support import OFTEN, TEXTURE
 
-SMALL = Config(
-    texture=TextureConfig(levels=4, table_size=2**10, width=16),
-    densify=DensifyConfig(every=3),  # so that 20 iterations have rounds
-)
-
-
+SMALL = Config(texture=TEXTURE, densify=OFTEN)
 FLAGS = ["--iterations", "20", "--max-surfels", "100", "--device", "cpu"]
 RUN_FILES = {
     "config.json",

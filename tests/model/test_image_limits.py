@@ -143,29 +143,19 @@ def test_lists_that_memory_cannot_hold(monkeypatch):
         nw.render(surfels, None, camera)
 
 
-@pytest.mark.parametrize(
-    ("error", "needed"),
-    [
-        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has"), "2.50 GiB"),
-        (RuntimeError("Failed to allocate 3221225472 bytes on device 'cuda:0'"), "3.00 GiB"),
-        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 5242880 bytes."), "5.00 MiB"),
-        (MemoryError(), "more than there is"),
-    ],
-)
-def test_an_allocation_that_fails_is_our_error(monkeypatch, error, needed, device):
+def test_an_allocation_that_fails_is_our_error(monkeypatch, device):
     surfels, texture, camera = parts(device)
     model = nw.Model(surfels, texture)
     expected = model.render(camera).image
 
     def fail(*arguments: Any) -> Any:
-        raise type(error)(*error.args)
+        raise RuntimeError("Failed to allocate 3221225472 bytes on device 'cuda:0'")
 
     monkeypatch.setattr(tiles, "_tile_polygons", fail)
-    with pytest.raises(
-        OutOfMemoryError, match=f"^out of memory: an image of 23x18 .* needs {needed}; {SMALLER}$"
-    ) as told:
+    line = f"^out of memory: an image of 23x18 .* needs 3.00 GiB; {SMALLER}$"
+    with pytest.raises(OutOfMemoryError, match=line) as told:
         model.render(camera)
-    assert told.value.needed == needed
+    assert told.value.needed == "3.00 GiB"
     monkeypatch.undo()
     assert torch.equal(model.render(camera).image, expected)
 

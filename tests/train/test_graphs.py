@@ -17,14 +17,13 @@ from nexwarp.data import Scene, View
 from nexwarp.model import graphs as step_graphs
 from nexwarp.train import target as training_views
 from nexwarp.train.densify import DensityControl
-from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig, with_settings
+from nexwarp.train.recipe import Config, DensifyConfig, with_settings
 from nexwarp.train.target import Target
 from nexwarp.train.trainer import Trainer
-from tests.trainer_support import assert_same_state
+from tests.trainer_support import TEXTURE, assert_same_state
 
 pytestmark = pytest.mark.cuda
 
-TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
 SETTINGS: dict[str, Any] = {
     "iterations": 120,
     "max_surfels": 400,

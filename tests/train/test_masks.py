@@ -8,14 +8,13 @@ import torch
 
 from nexwarp.data import Scene, View
 from nexwarp.run.evaluate import Evaluation, evaluate
-from nexwarp.train.recipe import Config, TextureConfig
+from nexwarp.train.recipe import Config
 from nexwarp.train.target import mean_color
 from nexwarp.train.trainer import Trainer
 from tests.tolerances import assert_close
+from tests.trainer_support import TEXTURE
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
-TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
 
 
 def make_trainer(scene: Scene, **settings) -> Trainer:

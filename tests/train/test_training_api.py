@@ -15,16 +15,12 @@ from nexwarp.cli import main as cli
 from nexwarp.data import Scene
 from nexwarp.errors import CheckpointError
 from nexwarp.train.optimizer import OptimizerMaker, ParameterGroup
-from nexwarp.train.recipe import DensifyConfig, TextureConfig
+from nexwarp.train.recipe import DensifyConfig
+from tests.trainer_support import small
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 
-SMALL = nw.Config(
-    iterations=40,
-    max_surfels=120,
-    texture=TextureConfig(levels=4, table_size=2**10, width=16),
-    densify=DensifyConfig(every=5),
-)
+SMALL = small(iterations=40, densify=DensifyConfig(every=5))
 
 
 def run(scene: Scene, until: int | None = None, **options: Any) -> nw.Trainer:
