@@ -19,6 +19,7 @@ import nexwarp as nw
 from nexwarp.data import Scene
 from nexwarp.kernels import launch
 from nexwarp.train import recipe
+from tests.cli.support import SMALL
 from tests.scene_writers import write_demo
 
 MOST_WORKERS = 4  # each takes 1 to 2 GB
@@ -76,9 +77,9 @@ def one_torch_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def small_preset(request: pytest.FixtureRequest, one_torch_thread: None) -> Iterator[None]:
-    """The module's SMALL as the default preset: the command line has no flags for the texture's shape."""
+    """The module's SMALL, or that of the commands' tests, as the default preset."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(recipe.PRESETS, "default", request.module.SMALL)
+        patch.setitem(recipe.PRESETS, "default", getattr(request.module, "SMALL", SMALL))
         yield
 
 

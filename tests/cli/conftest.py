@@ -1,22 +1,12 @@
 """A scene, a finished run of it, and a check of what the command line refuses."""
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from nexwarp.cli import main as cli
-from nexwarp.train import recipe
-from tests.cli.support import FLAGS, SMALL
-
-
-@pytest.fixture(scope="module")
-def small_preset(one_torch_thread: None) -> Iterator[None]:
-    """A small default preset: the command line has no flags for the texture's shape."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(recipe.PRESETS, "default", SMALL)
-        yield
+from tests.cli.support import FLAGS
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,7 @@ import pytest
 
 import nexwarp as nw
 from nexwarp.cli import main as cli
-from nexwarp.train import recipe
-from tests.cli.support import FLAGS, SMALL
+from tests.cli.support import FLAGS
 from tests.scenes import intrinsics, make_camera, make_surfels, make_texture, random_scene
 from tests.viewer.support import OPTIONS
 
@@ -24,10 +23,8 @@ def camera() -> nw.Camera:
 
 
 @pytest.fixture(scope="module")
-def run(tiny_folder, tmp_path_factory) -> Path:
+def run(tiny_folder, tmp_path_factory, small_preset) -> Path:
     """A tiny finished run."""
     folder = tmp_path_factory.mktemp("viewer") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(recipe.PRESETS, "default", SMALL)
-        assert cli.main(["train", str(tiny_folder), "--run", str(folder), *FLAGS]) == 0
+    assert cli.main(["train", str(tiny_folder), "--run", str(folder), *FLAGS]) == 0
     return folder
