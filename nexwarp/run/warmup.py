@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.data import Scene, View
+from nexwarp.data import Scene
 from nexwarp.ops import start_warp
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
@@ -57,17 +57,9 @@ def tiny_scene() -> Scene:
     viewmat = torch.eye(4)
     viewmat[2, 3] = 4.0
     K = torch.tensor([[WIDTH, 0.0, WIDTH / 2], [0.0, WIDTH, HEIGHT / 2], [0.0, 0.0, 1.0]])
-    view = View(Camera(viewmat, K, WIDTH, HEIGHT), photo, None, "tiny.png")
-    return Scene(
-        train=[view],
-        test=[view],
-        points=points,
-        colors=torch.randint(0, 256, (POINTS, 3), generator=generator, dtype=torch.uint8),
-        track_lengths=torch.full((POINTS,), 3, dtype=torch.int32),
-        reprojection_errors=torch.zeros(POINTS),
-        scale=1.0,
-        path=Path("tiny"),
-    )
+    colors = torch.randint(0, 256, (POINTS, 3), generator=generator, dtype=torch.uint8)
+    scene = Scene.from_tensors([photo], [Camera(viewmat, K, WIDTH, HEIGHT)], points, colors, test_every=0)
+    return dataclasses.replace(scene, test=scene.train)
 
 
 def cached_binaries() -> set[Path]:
