@@ -16,8 +16,9 @@ import tyro
 from rich.console import Console
 
 from nexwarp.cli import display
-from nexwarp.cli.options import Device_, Flag_, Host_, Port_, Preset_, Run_, check_max_hits, option, pick_device
+from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Run_, check_max_hits, pick_device
 from nexwarp.data import View
+from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import DEMO, SceneSource, scene_kinds
 from nexwarp.data.sfm import SfmOptions, process
 from nexwarp.data.sfm.photos import FILMS, OTHERS, SUFFIXES
@@ -57,9 +58,9 @@ class Process:
     of one command.
     """
 
-    source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="VIDEO|PHOTOS")]
+    source: Annotated[Path, tyro.conf.Positional, option("VIDEO|PHOTOS")]
     """A video (extra `video`), or a folder of photos (JPEG, PNG, TIFF, BMP, WebP, AVIF, HEIC) with its subfolders."""
-    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    scene: Annotated[Path, tyro.conf.Positional, option("SCENE")]
     """Output folder: images/ (undistorted), sparse/0/ (a COLMAP model) and the report sfm.json."""
     frames: Annotated[int, option("N")] = FRAMES
     """Number of equal parts of a video, of which each gives its sharpest frame."""

@@ -11,19 +11,13 @@ import tyro
 import warp as wp
 
 from nexwarp.cli import __version__
+from nexwarp.data.option import option
 from nexwarp.errors import RankError, SettingError
 from nexwarp.kernels.launch import get_num_threads, set_num_threads
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.train.ranks.ranks import Ranks, is_rank
 
-
-def option(metavar: str, default: str | None = None) -> object:
-    """Return tyro's settings of an option: its metavar in --help, and its default if the field's default is None."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=None if default is None else f"(default: {default})")
-
-
-Run_ = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-Flag_ = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
+Run_ = Annotated[Path, tyro.conf.Positional, option("RUN")]
 Device_ = Annotated[str | None, option("{cuda,cpu}", "cuda if there is one")]
 Preset_ = Annotated[str, option("NAME")]
 Port_ = Annotated[int, option("PORT")]

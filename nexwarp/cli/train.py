@@ -15,9 +15,10 @@ from rich.console import Console
 from nexwarp.cli import display
 from nexwarp.cli.commands import make_scene, needs_cameras, print_url, scene_folder_of, show_until_interrupted
 from nexwarp.cli.display import device_name
-from nexwarp.cli.options import Device_, Flag_, Host_, Port_, Preset_, check_max_hits, joined_ranks, option
+from nexwarp.cli.options import Device_, Host_, Port_, Preset_, check_max_hits, joined_ranks
 from nexwarp.cli.session import Session
 from nexwarp.data import Scene
+from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import SettingError
 from nexwarp.io.json_files import Json

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import numpy as np
 import torch
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from nexwarp.cameras.camera import Array, Camera
 from nexwarp.data.capture import (
@@ -34,6 +34,7 @@ from nexwarp.data.depth_files import with_depths
 from nexwarp.data.depth_fit import fit_depths
 from nexwarp.data.images import quiet_pillow
 from nexwarp.data.in_memory import as_bytes, make_cloud, near_origin, split_views
+from nexwarp.data.option import Flag_, option
 from nexwarp.data.ply import read_ply
 from nexwarp.data.random_points import random_points
 from nexwarp.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, read_blender, read_nerfstudio
@@ -81,25 +82,25 @@ def demo_folder() -> Path:
 class SceneSource:
     """Where a scene lies, and how to read it: the options of `load_scene`."""
 
-    path: Annotated[str, Positional, arg(metavar="SCENE")]
+    path: Annotated[str, Positional, option("SCENE")]
     """Folder of a COLMAP, nerfstudio or Blender scene, `demo`, a video, or a folder of photos (docs/scenes.md)."""
-    images: Annotated[str, arg(metavar="FOLDER")] = "images"
+    images: Annotated[str, option("FOLDER")] = "images"
     """Folder of the photos, in SCENE."""
-    downscale: Annotated[int, arg(metavar="N")] = 1
+    downscale: Annotated[int, option("N")] = 1
     """Factor by which photos are reduced."""
-    masks: Annotated[str, arg(metavar="FOLDER")] = MASKS
+    masks: Annotated[str, option("FOLDER")] = MASKS
     """Folder of masks, `alpha` or `none`."""
-    background: Annotated[str | None, arg(metavar="COLOUR", help_behavior_hint="(default: scene's)")] = None
+    background: Annotated[str | None, option("COLOUR", "scene's")] = None
     """white, black, R,G,B or random."""
-    points: Annotated[str | None, arg(metavar="FILE.ply", help_behavior_hint="(default: the scene's)")] = None
+    points: Annotated[str | None, option("FILE.ply", "the scene's")] = None
     """Initial points."""
-    format: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="(default: detected)")] = None
+    format: Annotated[str | None, option("NAME", "detected")] = None
     """colmap, nerfstudio or blender."""
-    follow_links: Annotated[bool, arg(help_behavior_hint="")] = False
+    follow_links: Flag_ = False
     """Follow symbolic links out of SCENE."""
-    skip_missing: Annotated[bool, arg(help_behavior_hint="")] = False
+    skip_missing: Flag_ = False
     """Go on without photos that do not exist."""
-    exclude: Annotated[tuple[str, ...], arg(metavar="NAME ...", help_behavior_hint="")] = ()
+    exclude: Annotated[tuple[str, ...], option("NAME ...", "")] = ()
     """Leave photos out, by name or pattern (*.png)."""
 
     @classmethod

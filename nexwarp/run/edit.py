@@ -7,12 +7,12 @@ from typing import Annotated
 
 import numpy as np
 import torch
-from tyro.conf import arg
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.paths import focus_ahead, subject
 from nexwarp.cameras.similarity import Similarity, upright
+from nexwarp.data.option import Flag_, option
 from nexwarp.errors import RunError, SettingError
 from nexwarp.export.bake import Progress
 from nexwarp.model.crop import REGIONS
@@ -31,24 +31,22 @@ GROUND = 0.2  # share of such surfels below the cameras that lies below the grou
 class EditOrder:
     """The operation of `nexwarp edit`, one at a time. Positions and lengths are in the coordinates of exports."""
 
-    crop: Annotated[
-        tuple[str, ...] | None, arg(metavar="{subject,box X0 Y0 Z0 X1 Y1 Z1,sphere X Y Z R}", help_behavior_hint="")
-    ] = None
+    crop: Annotated[tuple[str, ...] | None, option("{subject,box X0 Y0 Z0 X1 Y1 Z1,sphere X Y Z R}", "")] = None
     """Keep the surfels whose centres lie in a box along the axes, in a sphere, or around what all photos look at."""
-    remove_floaters: Annotated[bool, arg(help_behavior_hint="")] = False
+    remove_floaters: Flag_ = False
     """Remove surfels in empty space that few training views agree on."""
-    level: Annotated[bool, arg(help_behavior_hint="")] = False
+    level: Flag_ = False
     """Turn the scene's upward direction to +y, and put the ground at y = 0."""
-    scale: Annotated[float | None, arg(metavar="FACTOR", help_behavior_hint="")] = None
+    scale: Annotated[float | None, option("FACTOR", "")] = None
     """Multiply all coordinates."""
     scale_between: Annotated[
         tuple[float, float, float, float, float, float, float] | None,
-        arg(metavar="X Y Z X Y Z LENGTH", help_behavior_hint=""),
+        option("X Y Z X Y Z LENGTH", ""),
     ] = None
     """Scale so that two points get this distance, such as one that you have measured."""
-    origin: Annotated[tuple[float, float, float] | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
+    origin: Annotated[tuple[float, float, float] | None, option("X Y Z", "")] = None
     """Make this point (0, 0, 0)."""
-    undo: Annotated[bool, arg(help_behavior_hint="")] = False
+    undo: Flag_ = False
     """Take the last operation back."""
 
     def check(self) -> None:

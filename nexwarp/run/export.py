@@ -10,7 +10,6 @@ from typing import Annotated, cast
 
 import numpy as np
 import torch
-from tyro.conf import arg
 
 from nexwarp.cameras.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
@@ -18,6 +17,7 @@ from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.cameras.similarity import IDENTITY
 from nexwarp.data import View
 from nexwarp.data.images import image_size
+from nexwarp.data.option import option
 from nexwarp.data.scene import DEMO, SceneSource, demo_folder
 from nexwarp.data.transforms import lens_keys
 from nexwarp.errors import RunError, SettingError
@@ -63,29 +63,25 @@ UNDISTORTED = "undistorted"  # folder of names of views that no file shows
 class ExportOrder:
     """What `nexwarp export` writes."""
 
-    format: Annotated[str, arg(metavar="NAME")] = "ply"
+    format: Annotated[str, option("NAME")] = "ply"
     """ply, mesh, compact, cameras, web, glb, usd, spz or gltf-splats."""
-    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="(default: RUN/export)")] = None
+    out: Annotated[Path | None, option("FOLDER", "RUN/export")] = None
     """Output folder; with --format web also NAME.html, for one file with everything."""
-    quality: Annotated[str, arg(metavar="{quantised,full}")] = "quantised"
+    quality: Annotated[str, option("{quantised,full}")] = "quantised"
     """Of --format web: quantised files are a fifth to a half as large."""
-    alpha: Annotated[str, arg(metavar="{mask,blend}")] = "mask"
+    alpha: Annotated[str, option("{mask,blend}")] = "mask"
     """Of glb, usd: mask cuts surfels out, which all programs draw; blend is closer to photos, in those that sort."""
-    finetune: Annotated[bool, arg(help_behavior_hint="(default: to the training photos, where they are)")] = True
+    finetune: Annotated[bool, option(None, "to the training photos, where they are")] = True
     """Fit what is baked to the model's renderings alone."""
-    crop: Annotated[bool, arg(help_behavior_hint="(default: glb and usd keep what photos all around look at)")] = True
+    crop: Annotated[bool, option(None, "glb and usd keep what photos all around look at")] = True
     """Keep all surfels."""
-    noise: Annotated[float | None, arg(metavar="X", help_behavior_hint="(default: 8 % of the test views' error)")] = (
-        None
-    )
+    noise: Annotated[float | None, option("X", "8 % of the test views' error")] = None
     """Of compact: noise that its pictures may have, of 1; files with more are smaller."""
-    max_extent: Annotated[float, arg(metavar="X")] = MAX_EXTENT
+    max_extent: Annotated[float, option("X")] = MAX_EXTENT
     """Of splats: split surfels larger than this share of their distance to the nearest camera; inf splits none."""
-    voxel: Annotated[
-        float | None, arg(metavar="LENGTH", help_behavior_hint="(default: 1.5 pixels of the photos at median depth)")
-    ] = None
+    voxel: Annotated[float | None, option("LENGTH", "1.5 pixels of the photos at median depth")] = None
     """Resolution of the mesh in world units."""
-    far: Annotated[float | None, arg(metavar="DEPTH", help_behavior_hint="(default: 3 scene scales)")] = None
+    far: Annotated[float | None, option("DEPTH", "3 scene scales")] = None
     """Largest distance of the mesh from each camera in world units."""
 
     def check(self) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, cast, get_args
 
 import torch
-from tyro.conf import arg
 
 from nexwarp.cameras.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, WORLD
@@ -18,6 +17,7 @@ from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.cameras.paths import PATHS, suited_path
 from nexwarp.cameras.ray_camera import MAX_SIDE, RayCamera
 from nexwarp.cameras.similarity import IDENTITY, Similarity
+from nexwarp.data.option import Flag_, option
 from nexwarp.errors import RunError, SettingError
 from nexwarp.io.pictures import save_png, to_uint8
 from nexwarp.io.video import check_video, video_writer
@@ -49,36 +49,30 @@ class PictureJob:
 class RenderOrder:
     """What `nexwarp render` shows, and how."""
 
-    path: Annotated[str | None, arg(metavar="PATH", help_behavior_hint="(default: ellipse or interpolate)")] = None
+    path: Annotated[str | None, option("PATH", "ellipse or interpolate")] = None
     """Camera path: ellipse, spiral, interpolate, or FILE.json, a nerfstudio camera path or a transforms.json. By
     default an ellipse if the cameras surround what they look at, otherwise interpolate."""
-    video: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="(default: none)")] = None
+    video: Annotated[Path | None, option("FILE", "none")] = None
     """Also write the path as a video: .mp4, .mov, .mkv (H.264) or .webm (VP9). Needs the extra `video`."""
-    frames: Annotated[int | None, arg(metavar="N", help_behavior_hint="(default: 120, or that of FILE.json)")] = None
+    frames: Annotated[int | None, option("N", "120, or that of FILE.json")] = None
     """Number of frames of the path; 0 renders no path."""
-    fps: Annotated[float | None, arg(metavar="N", help_behavior_hint="(default: 30, or that of FILE.json)")] = None
+    fps: Annotated[float | None, option("N", "30, or that of FILE.json")] = None
     """Frames per second of the video."""
-    set: Annotated[
-        str | None, arg(metavar="{test,train,all}", help_behavior_hint="(default: test without --path and --video)")
-    ] = None
+    set: Annotated[str | None, option("{test,train,all}", "test without --path and --video")] = None
     """Still views to render."""
-    buffers: Annotated[bool, arg(help_behavior_hint="")] = False
+    buffers: Flag_ = False
     """Also write all buffers (depths, normals, weights ...) of the still views, else of the frames, as OpenEXR."""
-    size: Annotated[str | None, arg(metavar="WIDTHxHEIGHT", help_behavior_hint="(default: that of the photos)")] = None
+    size: Annotated[str | None, option("WIDTHxHEIGHT", "that of the photos")] = None
     """Image size in pixels, such as 1920x1080; keeps the vertical field of view."""
-    scale: Annotated[float, arg(metavar="FACTOR")] = 1.0
+    scale: Annotated[float, option("FACTOR")] = 1.0
     """Factor on the size of the photos, instead of --size."""
-    camera: Annotated[str, arg(metavar="NAME")] = PINHOLE
+    camera: Annotated[str, option("NAME")] = PINHOLE
     """pinhole, panorama or fisheye (docs/cameras.md)."""
-    fov: Annotated[float, arg(metavar="DEGREES")] = 180.0
+    fov: Annotated[float, option("DEGREES")] = 180.0
     """Angle that the smaller side of a fisheye image shows."""
-    exposure: Annotated[str | None, arg(metavar="{photos,mean}", help_behavior_hint="(default: that of the model)")] = (
-        None
-    )
+    exposure: Annotated[str | None, option("{photos,mean}", "that of the model")] = None
     """Exposure and white balance: of the photos near each camera, or their mean for all images."""
-    order: Annotated[str | None, arg(metavar="{depth,distance}", help_behavior_hint="(default: that of the model)")] = (
-        None
-    )
+    order: Annotated[str | None, option("{depth,distance}", "that of the model")] = None
     """Blend surfels by z-depth, or by distance from the camera, which suits panoramas (docs/cameras.md)."""
 
     def check(self) -> None:
@@ -107,11 +101,11 @@ class RenderOrder:
                 f"--fov: expected together with --camera fisheye, got --camera {self.camera}",
             ),
         ]
-        for option, value, kind in (("exposure", self.exposure, Exposure), ("order", self.order, Order)):
+        for name, value, kind in (("exposure", self.exposure, Exposure), ("order", self.order, Order)):
             known = get_args(kind)
-            checks.append((value not in (None, *known), f"--{option}: expected {' or '.join(known)}, got {value!r}"))
-        for option, asked in (("order", self.order is not None), ("buffers", self.buffers)):
-            message = f"--{option}: expected together with --camera pinhole, got --camera {self.camera}"
+            checks.append((value not in (None, *known), f"--{name}: expected {' or '.join(known)}, got {value!r}"))
+        for name, asked in (("order", self.order is not None), ("buffers", self.buffers)):
+            message = f"--{name}: expected together with --camera pinhole, got --camera {self.camera}"
             checks.append((asked and self.camera != PINHOLE, message))
         for wrong, message in checks:
             if wrong:
@@ -121,8 +115,8 @@ class RenderOrder:
             try:
                 check_video(self.video, FPS if self.fps is None else self.fps)
             except ValueError as error:
-                option = "--fps" if str(error).startswith("fps: ") else "--video"
-                raise SettingError(f"{option}: {str(error).removeprefix('fps: ')}") from None
+                flag = "--fps" if str(error).startswith("fps: ") else "--video"
+                raise SettingError(f"{flag}: {str(error).removeprefix('fps: ')}") from None
 
     @property
     def has_path(self) -> bool:
