@@ -3,7 +3,6 @@
 import {gainsOf, positionOf, rayOf} from "nexwarp/program.js";
 import {SceneError, checkValues} from "nexwarp/scene.js";
 
-const BUCKETS = 1 << 16; // of the depth sort
 const LARGEST_FLOAT = 3.5e38;
 const ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.99, TINY = 1e-20;
 
@@ -17,8 +16,9 @@ export class BakedScene {
         this.usedCoefficients = Math.min(this.coefficients, (header.options.sh_degree + 1) ** 2);
         this.#pack();
         this.depths = new Float32Array(this.count);
-        this.order = new Uint32Array(this.count);
-        this.buckets = new Uint32Array(BUCKETS + 1);
+        this.bits = new Uint32Array(this.depths.buffer);
+        [this.keys, this.order, this.spare] = [0, 1, 2].map(() => new Uint32Array(this.count));
+        this.starts = new Uint32Array(2049); // of the radix sort
     }
 
     // Eight RGBA texels a surfel: x axis and scale, y axis and scale, centre and opacity, gammas and farthest, box, rect,
@@ -47,34 +47,23 @@ export class BakedScene {
         for (let k = 0; k < values * this.count; ++k) this.harmonics.set(shN.subarray(3 * k, 3 * k + 3), 4 * k);
     }
 
-    // Surfels from far to near, by the depth of their centres.
+    // Surfels from far to near, by the depth of their centres: a radix sort of the bits, which are in the order of positive
+    // floats, and in the opposite one of negative floats.
     sorted(viewmat) {
-        const {means} = this.arrays, {count, depths, order, buckets} = this;
+        const {means} = this.arrays, {count, depths, bits, keys, starts} = this;
+        let {order, spare} = this;
         const [a, b, c, d] = viewmat.slice(8, 12);
-        let low = Infinity, high = -Infinity;
         for (let i = 0, j = 0; i < count; ++i, j += 3) {
-            const depth = a * means[j] + b * means[j + 1] + c * means[j + 2] + d;
-            depths[i] = depth;
-            low = Math.min(low, depth);
-            high = Math.max(high, depth);
+            depths[i] = a * means[j] + b * means[j + 1] + c * means[j + 2] + d;
+            keys[i] = bits[i] >>> 31 ? bits[i] : 0x7fffffff - bits[i];
+            order[i] = i;
         }
-        // Equal shares of 1 / depth beyond a tenth of the largest depth would starve what is near: the logarithm is fair.
-        const shift = Math.max(high - low, 1e-12) * 1e-3, scale = (BUCKETS - 1) / Math.log((high - low + shift) / shift);
-        const place = depth => BUCKETS - 1 - Math.floor(Math.log((depth - low + shift) / shift) * scale);
-        buckets.fill(0);
-        const keys = (this.keys ??= new Uint32Array(count));
-        for (let i = 0; i < count; ++i) ++buckets[(keys[i] = Math.min(Math.max(place(depths[i]), 0), BUCKETS - 1)) + 1];
-        for (let k = 0; k < BUCKETS; ++k) buckets[k + 1] += buckets[k];
-        for (let i = 0; i < count; ++i) order[buckets[keys[i]]++] = i;
-        // Within a bucket, insertion sort: few surfels share one.
-        for (let k = 1; k < count; ++k) {
-            const i = order[k];
-            let j = k - 1;
-            while (j >= 0 && k - j < 64 && depths[order[j]] < depths[i]) {
-                order[j + 1] = order[j];
-                --j;
-            }
-            order[j + 1] = i;
+        for (const shift of [0, 11, 22]) {
+            starts.fill(0);
+            for (let i = 0; i < count; ++i) ++starts[((keys[i] >>> shift) & 2047) + 1];
+            for (let k = 0; k < 2048; ++k) starts[k + 1] += starts[k];
+            for (const i of order) spare[starts[(keys[i] >>> shift) & 2047]++] = i;
+            [order, spare] = [spare, order];
         }
         return order;
     }
