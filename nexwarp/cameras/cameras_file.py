@@ -30,8 +30,7 @@ def save_cameras(
     for group, members in cameras.items():
         entries = {}
         for name, camera in members.items():
-            entry: dict[str, object] = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
-            entry |= {"width": camera.width, "height": camera.height, "near": camera.near}
+            entry = camera_entry(camera)
             given = camera if before is None else before[group][name]
             if not torch.equal(given.viewmat.cpu(), camera.viewmat.cpu()):
                 entry["given_viewmat"] = given.viewmat.tolist()
@@ -66,7 +65,7 @@ def load_cameras(path: str | os.PathLike[str]) -> dict[str, dict[str, Camera]]:
         check_range("number of cameras", sum(len(members) for members in groups.values()), 0, MAX_CAMERAS)
         origin = origin_of(data)
         return {
-            group: {_file_name(name): _camera(entry, origin) for name, entry in members.items()}
+            group: {_file_name(name): camera_of(entry, origin) for name, entry in members.items()}
             for group, members in groups.items()
         }
     except FileNotFoundError:
@@ -101,6 +100,13 @@ def origin_of(data: Mapping[str, object]) -> tuple[float, float, float] | None:
     return x, y, z
 
 
-def _camera(entry: dict[str, Any], origin: tuple[float, float, float] | None) -> Camera:
+def camera_entry(camera: Camera) -> dict[str, object]:
+    """Return a camera, but for the origin of its frame, as JSON values."""
+    entry = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width}
+    return entry | {"height": camera.height, "near": camera.near}
+
+
+def camera_of(entry: dict[str, Any], origin: tuple[float, float, float] | None) -> Camera:
+    """Return the camera of `camera_entry`, in a frame with an origin."""
     viewmat, K = torch.tensor(entry["viewmat"]), torch.tensor(entry["K"])
     return Camera(viewmat, K, entry["width"], entry["height"], near=entry["near"], origin=origin)

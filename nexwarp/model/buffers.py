@@ -8,7 +8,7 @@ import torch
 from typing_extensions import Unpack
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.cameras.cameras_file import origin_of
+from nexwarp.cameras.cameras_file import camera_entry, camera_of, origin_of
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.model import Model
 from nexwarp.model.options import RenderChanges
@@ -75,14 +75,7 @@ def save_buffers(path: str | os.PathLike[str], buffers: Buffers) -> None:
         "format": FORMAT,
         "max_hits": buffers.ids.shape[2],
         "background": None if background.ndim > 1 else background.tolist(),
-        "camera": {
-            "viewmat": camera.viewmat.tolist(),
-            "K": camera.K.tolist(),
-            "width": camera.width,
-            "height": camera.height,
-            "near": camera.near,
-            **({"origin": list(camera.origin)} if camera.origin else {}),
-        },
+        "camera": camera_entry(camera) | ({"origin": list(camera.origin)} if camera.origin else {}),
         "frame": "world to camera; cameras x right, y down, z forward; pixel centres at +0.5",
     }
     save_exr(path, parts, metadata)
@@ -95,9 +88,7 @@ def load_buffers(path: str | os.PathLike[str]) -> Buffers:
     try:
         if metadata["format"] != FORMAT:
             raise ValueError(f"format: expected {FORMAT}, got {metadata['format']}")
-        stored = metadata["camera"]
-        viewmat, K = (torch.tensor(stored[name], dtype=torch.float32) for name in ("viewmat", "K"))
-        camera = Camera(viewmat, K, stored["width"], stored["height"], stored["near"], origin=origin_of(stored))
+        camera = camera_of(metadata["camera"], origin_of(metadata["camera"]))
         slots = range(metadata["max_hits"])
         buffers: dict[str, torch.Tensor] = {}
         for name in PASSES:
