@@ -14,6 +14,7 @@ from nexwarp.cameras.similarity import upright
 from nexwarp.errors import FormatError
 from nexwarp.export.baked_scene import BakedScene
 from nexwarp.export.glb import quads
+from nexwarp.export.mesh import Mesh
 from nexwarp.export.splats import gaussians
 from nexwarp.io.files import write_atomically
 from nexwarp.io.pictures import to_uint8
@@ -27,13 +28,19 @@ ROOT, VARIANTS = "/Scene", "shown"
 
 @torch.no_grad()
 def save_usdz(
-    path: str | os.PathLike[str], scene: BakedScene, surfels: Surfels, sh_degree: int, cameras: Sequence[Camera]
+    path: str | os.PathLike[str],
+    scene: BakedScene,
+    surfels: Surfels,
+    sh_degree: int,
+    cameras: Sequence[Camera],
+    collision: Mesh | None = None,
 ) -> None:
     """Write cards and surfels as one USDZ file, atomically; the default prim's variant `shown` chooses between them.
 
     `Cards`, which is shown at first, is a mesh of quads with one unlit UsdPreviewSurface. `Surfels` is a particle field
-    with the kernel of Gaussian surflets: the plain appearance, with gamma = 1, and SH up to `sh_degree`. The mean of
-    the cameras' upward directions becomes +y, by the default prim. FormatError: there are no cards.
+    with the kernel of Gaussian surflets: the plain appearance, with gamma = 1, and SH up to `sh_degree`. `Collision`,
+    if given, is a mesh that is not shown, for physics. The mean of the cameras' upward directions becomes +y, by the
+    default prim. FormatError: there are no cards.
     """
     from PIL import Image
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils
@@ -51,6 +58,8 @@ def save_usdz(
         turn[:3, :3] = upright(cameras)
         root.AddTransformOp().Set(Gf.Matrix4d(turn.T.tolist()))  # of row vectors
         forms = {"cards": _cards(stage, scene), "surfels": _particles(stage, surfels, sh_degree)}
+        if collision is not None:
+            _collider(stage, collision)
         choice = root.GetPrim().GetVariantSets().AddVariantSet(VARIANTS)
         for name in forms:
             choice.AddVariant(name)
@@ -72,13 +81,7 @@ def _cards(stage: "Usd.Stage", scene: BakedScene) -> "UsdGeom.Gprim":
     from pxr import Gf, Sdf, UsdGeom, UsdShade, Vt
 
     corners, places, _ = quads(scene)
-    mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/Cards")
-    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(corners.astype(np.float32)))
-    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(corners) // 4, 4, np.int32)))
-    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.arange(len(corners), dtype=np.int32)))
-    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    mesh.CreateDoubleSidedAttr(True)
-    mesh.CreateExtentAttr(_extent(corners))
+    mesh = _mesh(stage, "Cards", corners, np.arange(len(corners)).reshape(-1, 4))
     interface = UsdGeom.PrimvarsAPI(mesh)
     kind = Sdf.ValueTypeNames.TexCoord2fArray
     st = interface.CreatePrimvar("st", kind, UsdGeom.Tokens.vertex)
@@ -110,6 +113,30 @@ def _cards(stage: "Usd.Stage", scene: BakedScene) -> "UsdGeom.Gprim":
         surface.CreateInput("opacityThreshold", Sdf.ValueTypeNames.Float).Set(scene.cut.cutoff)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", Sdf.ValueTypeNames.Token))
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    return mesh
+
+
+def _collider(stage: "Usd.Stage", collision: Mesh) -> None:
+    """Define the mesh that things bump into: a guide, which programs do not draw."""
+    from pxr import UsdGeom, UsdPhysics
+
+    mesh = _mesh(stage, "Collision", collision.vertices, collision.triangles)
+    mesh.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
+    UsdPhysics.MeshCollisionAPI.Apply(mesh.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.none)
+
+
+def _mesh(stage: "Usd.Stage", name: str, points: np.ndarray, faces: np.ndarray) -> "UsdGeom.Mesh":
+    """Define a mesh of points (V, 3) and faces (F, corners) of their indices."""
+    from pxr import UsdGeom, Vt
+
+    mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/{name}")
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), faces.shape[1], np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    mesh.CreateDoubleSidedAttr(True)
+    mesh.CreateExtentAttr(_extent(points))
     return mesh
 
 

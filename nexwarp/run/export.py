@@ -17,7 +17,7 @@ from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.cameras.similarity import IDENTITY
 from nexwarp.data import View
 from nexwarp.data.images import image_size
-from nexwarp.data.option import option
+from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import DEMO, SceneSource, demo_folder
 from nexwarp.data.transforms import lens_keys
 from nexwarp.errors import RunError, SettingError
@@ -25,7 +25,7 @@ from nexwarp.export.bake import Progress
 from nexwarp.export.baked_scene import GLB, load_baked
 from nexwarp.export.fit import Views
 from nexwarp.export.glb import ALPHAS, bake_cards, save_glb
-from nexwarp.export.mesh import extract_mesh, save_mesh
+from nexwarp.export.mesh import Mesh, extract_mesh, save_mesh
 from nexwarp.export.splats import (
     MAX_EXTENT,
     SPLAT_DEGREE,
@@ -43,7 +43,7 @@ from nexwarp.model.crop import REGIONS
 from nexwarp.model.edit import moved_poses, moved_surfels
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
-from nexwarp.run.edit import edited, subject_crop
+from nexwarp.run.edit import MIDDLE, edited, subject_crop
 from nexwarp.run.evaluate import compared, lpips_vgg, psnr, ssim, weights_file
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, METRICS_FILE, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
 from nexwarp.train.recipe import MASK_MODES
@@ -56,6 +56,7 @@ BAKED = ("web", *CARDS)  # formats whose texture is baked, and fitted to photos
 READ = ("web", "glb")  # of these, those that can be read back
 Figures = dict[str, dict[str, float]]  # metrics on test views, of what was baked and of the model
 GREY_LEVEL = 1 / 255
+COLLISION_VOXELS = 48  # along the scene's longest side
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows
 
 
@@ -79,6 +80,8 @@ class ExportOrder:
     """Of compact: noise that its pictures may have, of 1; files with more are smaller."""
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
     """Of splats: split surfels larger than this share of their distance to the nearest camera; inf splits none."""
+    collision: Flag_ = False
+    """Of usd: add a coarse mesh for physics, which is not shown."""
     voxel: Annotated[float | None, option("LENGTH", "1.5 pixels of the photos at median depth")] = None
     """Resolution of the mesh in world units."""
     far: Annotated[float | None, option("DEPTH", "3 scene scales")] = None
@@ -96,6 +99,8 @@ class ExportOrder:
             raise SettingError(f"--alpha: expected {' or '.join(ALPHAS)}, got {self.alpha!r}")
         if self.format != "mesh" and (self.voxel is not None or self.far is not None):
             raise SettingError(f"--voxel, --far: expected together with --format mesh, got --format {self.format}")
+        if self.format != "usd" and self.collision:
+            raise SettingError(f"--collision: expected together with --format usd, got --format {self.format}")
         package, extra = PACKAGES.get(self.format, ("torch", ""))
         if importlib.util.find_spec(package) is None:
             need = f"--format {self.format}: needs the package {package}, found none"
@@ -216,7 +221,8 @@ def _export_geometry(
         if order.format == "glb":
             save_glb(files[0], cards, moved)
         else:
-            save_usdz(files[0], cards, surfels, degree, moved)
+            collision = _collision(opened, device, observe) if order.collision else None
+            save_usdz(files[0], cards, surfels, degree, moved, collision)
         return
     if order.format == "ply":
         save_surfels_ply(files[0], surfels)
@@ -227,6 +233,15 @@ def _export_geometry(
         save_splats_spz(files[-1], splats)
     else:
         save_splats_ply(files[-1], splats)
+
+
+def _collision(opened: OpenedModel, device: torch.device | str, observe: Progress) -> Mesh:
+    """Return a coarse mesh of a run's surface, in the exported coordinates."""
+    model = opened.model.to(device)
+    low, high = np.quantile(model.surfels.means.detach().cpu().numpy(), MIDDLE, axis=0)
+    voxel = float((high - low).max()) / COLLISION_VOXELS
+    mesh = extract_mesh(model, [*opened.cameras.get(TRAIN, {}).values()], voxel=voxel, observe=observe)
+    return mesh.moved(opened.frame)
 
 
 def _photos(opened: OpenedModel, device: torch.device | str, observe: Progress) -> tuple[list[View], list[View]]:

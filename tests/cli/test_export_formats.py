@@ -11,6 +11,7 @@ import torch
 from PIL import Image, ImageOps
 
 from nexwarp.cli import main as cli
+from nexwarp.data.ply import read_vertices
 from nexwarp.export.baked_scene import load_baked
 from nexwarp.export.web import baked
 from nexwarp.run.export import ExportOrder, _photos, export_run
@@ -78,6 +79,21 @@ def test_gltf_of_an_object_holds_the_subject_alone(finished, monkeypatch):
     assert (np.linalg.norm(exported(crop=False) - [1, 0, 0], axis=1) > 2.001).any() and len(lines) == 3
     assert cli.main(["edit", str(finished), "--crop", "box", "-50", "-50", "-50", "50", "50", "0.1"]) == 0
     assert (np.linalg.norm(exported() - [1, 0, 0], axis=1) > 2.001).any() and len(lines) == 4
+
+
+def test_a_collision_mesh_is_in_the_exported_coordinates(finished, capsys, monkeypatch):
+    usd = pytest.importorskip("pxr.Usd")
+    monkeypatch.setattr("nexwarp.export.glb.CUTOFF", 0.05)
+    assert cli.main(["edit", str(finished), "--scale", "2"]) == 0
+    command = ["export", str(finished), "--no-crop", "--device", "cpu", "--format"]
+    refused(capsys, [*command, "glb", "--collision"], "--collision", "--format usd")
+    assert cli.main([*command, "usd", "--collision"]) == 0
+    assert cli.main([*command, "mesh"]) == 0
+    stage = usd.Stage.Open(str(finished / "export" / "scene.usdz"))
+    points = np.array(stage.GetPrimAtPath("/Scene/Collision").GetAttribute("points").Get())
+    vertices = read_vertices(finished / "export" / "mesh.ply")
+    finer = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    assert np.allclose(np.quantile(points, (0.1, 0.9), axis=0), np.quantile(finer, (0.1, 0.9), axis=0), atol=0.5)
 
 
 def test_a_cropped_export_learns_from_the_pixels_that_show_what_is_left(finished, tmp_path):

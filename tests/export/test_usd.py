@@ -12,6 +12,7 @@ from nexwarp.cameras.similarity import upright
 from nexwarp.errors import FormatError
 from nexwarp.export.bake import bake
 from nexwarp.export.glb import make_cards, quads
+from nexwarp.export.mesh import Mesh
 from nexwarp.export.usd import save_usdz
 from nexwarp.io.pictures import to_uint8
 from tests.export.test_bake import make_model
@@ -83,6 +84,22 @@ def test_a_stage_has_the_cards_and_the_surfels(model, cards, views, tmp_path):
             for name in ("Cards", "Surfels")
         }
         assert [name for name, is_visible in visible.items() if not is_visible] == [hidden]
+
+
+def test_a_collision_mesh_is_there_for_physics_and_not_drawn(model, cards, views, tmp_path):
+    from pxr import Usd, UsdGeom, UsdValidation
+
+    points, faces = np.eye(4, 3, dtype=np.float32), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
+    save_usdz(tmp_path / "scene.usdz", cards, model.surfels, 1, views, Mesh(points, points, points, faces))
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdz"))
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert not [error.GetMessage() for error in UsdValidation.ValidationContext(validators).Validate(stage)]
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Scene/Collision"))
+    assert mesh.ComputePurpose() == "guide"
+    assert mesh.GetPrim().GetAppliedSchemas() == ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"]
+    assert np.array_equal(np.array(mesh.GetPointsAttr().Get()), points)
+    assert list(mesh.GetFaceVertexIndicesAttr().Get()) == faces.ravel().tolist()
+    assert list(mesh.GetFaceVertexCountsAttr().Get()) == [3] * 4
 
 
 def test_without_cards_there_is_no_file(model, views, tmp_path):
