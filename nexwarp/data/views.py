@@ -106,22 +106,20 @@ class ViewReader:
 
     def plan(self, photo: Photo) -> list[PlannedView]:
         """Read the header of a photo and check it against its lens; return one view, or six for a panorama."""
-        size = width, height = image_size(photo.file)
-        lens = photo.lens
+        size, lens = image_size(photo.file), photo.lens
         # Tolerance: the size of a reduced image, as in a folder images_4, is rounded by up to one pixel.
-        if abs(width * lens.height - height * lens.width) > max(lens.width, lens.height):
-            raise ValueError(
-                f"{photo.file}: expected an image of {lens.width}x{lens.height} pixels, or that shape at another "
-                f"size, got {width}x{height}"
-            )
-        _check_enlarged(photo.file, size, (lens.width, lens.height), "its camera")
+        full = (lens.width, lens.height)
+        _check_shape(photo.file, size, full, "an image", max(full))
+        _check_enlarged(photo.file, size, full, "its camera")
         if photo.mask is not None and not self.alpha_mask:
-            _check_mask(photo, photo.mask, size)
+            shape = image_size(photo.mask)
+            _check_shape(photo.mask, shape, size, "a mask", max(*size, *shape), photo)
+            _check_enlarged(photo.mask, shape, size, "its photo")
         try:
             target = undistorted(lens)
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"{photo.file}: the camera of this image is not usable: {one_line(error)}") from error
-        ratio = width / lens.width, height / lens.height
+        ratio = size[0] / lens.width, size[1] / lens.height
         target = target.resized(
             *(max(round(a * b), 1) for a, b in zip((target.width, target.height), ratio, strict=True))
         )
@@ -185,11 +183,8 @@ class ViewReader:
             raise ValueError(f"{file}: expected no depth map of a panorama, which cannot be used")
         values, (width, height) = read_depth(file), plan.size
         rows, columns = values.shape
-        if abs(columns * height - rows * width) > SHAPE_TOLERANCE * columns * height:
-            raise ValueError(
-                f"{file}: expected a depth map of {width}x{height} pixels as {plan.photo.file.name} has, or that shape "
-                f"at another size, got {columns}x{rows}"
-            )
+        slack = SHAPE_TOLERANCE * columns * height
+        _check_shape(file, (columns, rows), plan.size, "a depth map", slack, plan.photo)
         if plan.photo.lens.distorted:
             values = self._map(plan).nearest(values.float()).half()
         else:
@@ -223,16 +218,16 @@ def _mask(photo: Photo, image: torch.Tensor, alpha: torch.Tensor | None) -> torc
     return mask if mask.shape == (height, width) else resize_nearest(mask, width, height)
 
 
-def _check_mask(photo: Photo, mask: Path, size: tuple[int, int]) -> None:
-    """Check the size of a mask against its photo's width and height, before it is decoded."""
-    width, height = size
-    columns, rows = image_size(mask)
-    if abs(columns * height - rows * width) > max(width, height, columns, rows):
+def _check_shape(
+    file: Path, size: tuple[int, int], expected: tuple[int, int], what: str, slack: float, photo: Photo | None = None
+) -> None:
+    """Raise ValueError unless width and height have the ratio of those expected, which are those of a photo's file."""
+    if abs(size[0] * expected[1] - size[1] * expected[0]) > slack:
+        whose = "" if photo is None else f" as {photo.file.name} has"
         raise ValueError(
-            f"{mask}: expected a mask of {width}x{height} pixels as {photo.file.name} has, or that shape at "
-            f"another size, got {columns}x{rows}"
+            f"{file}: expected {what} of {expected[0]}x{expected[1]} pixels{whose}, or that shape at another size, "
+            f"got {size[0]}x{size[1]}"
         )
-    _check_enlarged(mask, (columns, rows), size, "its photo")
 
 
 def _check_enlarged(file: Path, size: tuple[int, int], expected: tuple[int, int], what: str) -> None:
