@@ -23,6 +23,7 @@ from nexwarp.io import json_files
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import parse_json
 from nexwarp.model.model_file import load, save_model
+from tests.data.inputs import room
 from tests.data.test_scene import HEIGHT, WIDTH, make_scene, pose
 from tests.model_file_support import make_model, rewrite
 
@@ -100,15 +101,8 @@ def test_links_stay_in_the_scene(tmp_path):
 @pytest.mark.parametrize("key", ["file_path", "mask_path", "ply_file_path"])
 def test_links_of_transforms_stay_in_the_scene(tmp_path, key):
     path = tmp_path / "scene"
-    (path / "images").mkdir(parents=True)
-    frames = []
-    for index in range(3):
-        viewmat = np.eye(4)
-        viewmat[:3] = pose(index)
-        matrix = np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        Image.new("RGB", (8, 6)).save(path / f"images/{index}.png")
-        frames.append({"file_path": f"images/{index}.png", "transform_matrix": matrix.tolist()})
-    data = {"w": 8, "h": 6, "fl_x": 9.0, "frames": frames}
+    data = room.transforms([f"images/{name}" for name in room.write_photos(path / "images")])
+    frames = data["frames"]
     (tmp_path / "private").write_bytes((path / "images/0.png").read_bytes())
     (path / "link.png").symlink_to(tmp_path / "private")
     (data if key == "ply_file_path" else frames[1])[key] = "link.png"
@@ -116,16 +110,15 @@ def test_links_of_transforms_stay_in_the_scene(tmp_path, key):
     refused(path, rf"{key}.* 'link.png': a link leaves .*, expected a file in it; --follow-links allows it")
     if key == "file_path":  # the link leads to a picture
         (path / "images/1.png").unlink()
-        assert len(load_scene(path, follow_links=True).train) == 2
+        assert len(load_scene(path, follow_links=True).train) == 5
 
 
 @pytest.mark.parametrize("kind", ["colmap", "nerfstudio"])
 def test_missing_photos_are_all_named_at_once(tmp_path, kind):
     path = make_scene(tmp_path)
     if kind == "nerfstudio":
-        poses = [np.eye(4) + np.outer([i, 0, 0, 0], [0, 0, 0, 1]) for i in range(10)]
-        frames = [{"file_path": f"images/{i:02d}.png", "transform_matrix": poses[i].tolist()} for i in range(10)]
-        (path / "transforms.json").write_text(json.dumps({"fl_x": 40.0, "w": WIDTH, "h": HEIGHT, "frames": frames}))
+        size = {"w": WIDTH, "h": HEIGHT, "cx": None, "cy": None}
+        room.write_transforms(path, room.transforms([f"images/{i:02d}.png" for i in range(10)], **size))
         shutil.rmtree(path / "sparse")
     for name in ("03.png", "07.png"):
         (path / "images" / name).unlink()
