@@ -81,12 +81,6 @@ def test_failure_leaves_the_old_video_and_nothing_else(tmp_path: Path) -> None:
 
 
 def test_wrong_inputs_are_named(tmp_path: Path) -> None:
-    for name in ("a.avi", "a", ".mp4"):
-        with pytest.raises(ValueError, match=r"expected a video ending in \.mp4, \.mov, \.mkv, \.webm, got"):
-            check_video(tmp_path / name, 30.0)
-    for fps in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match="fps: expected more than 0 and at most 1000 frames a second"):
-            check_video(tmp_path / "a.mp4", fps)
     with pytest.raises(ValueError, match="height: expected at least 2"), video_writer(tmp_path / "a.mp4", 32, 1):
         pass
     (tmp_path / "file").touch()
