@@ -59,7 +59,8 @@ class Process:
     """
 
     source: Annotated[Path, tyro.conf.Positional, option("VIDEO|PHOTOS")]
-    """A video (extra `video`), or a folder of photos (JPEG, PNG, TIFF, BMP, WebP, AVIF, HEIC) with its subfolders."""
+    """A video (extra `video`), or a folder of photos (JPEG, PNG, TIFF, BMP, WebP, AVIF, HEIC) with its subfolders; also
+    of 360 degrees."""
     scene: Annotated[Path, tyro.conf.Positional, option("SCENE")]
     """Output folder: images/ (undistorted), sparse/0/ (a COLMAP model) and the report sfm.json."""
     frames: Annotated[int, option("N")] = FRAMES

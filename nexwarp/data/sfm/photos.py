@@ -197,7 +197,7 @@ def _read_photo(folder: Path, name: str, prepared: Path | None) -> InputPhoto:
     else:
         pixels = read_image(path)
         if prepared is not None:
-            _link(path, prepared / name)
+            link(path, prepared / name)
     height, width = pixels.shape[:2]
     luma = photo_luma(pixels)
     del pixels  # before pycolmap reads it
@@ -212,7 +212,8 @@ def _read_photo(folder: Path, name: str, prepared: Path | None) -> InputPhoto:
     return InputPhoto(name, (width, height), _device(path), focal, score, thumbnail)
 
 
-def _link(file: Path, target: Path) -> None:
+def link(file: Path, target: Path) -> None:
+    """Make `target` a link to a file, with its folders; a copy where the system allows no links."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         target.symlink_to(file.absolute())

@@ -106,10 +106,13 @@ class SfmReport:
     frames: FrameChoice | None = None  # the frames of a video; None for photos
     mapper: str = "incremental"  # or "global"
     skipped: dict[str, str] = field(default_factory=dict)  # name -> reason, for each photo that was not read
+    panoramas: int = 0  # number of panoramas, each cut into six of the photos
 
     def rows(self) -> dict[str, str]:
         """The figures as rows of a table: name -> text."""
         rows = {} if self.frames is None else self.frames.rows()
+        if self.panoramas:
+            rows["panoramas"] = f"{self.panoramas}, each cut into six photos"
         rows |= {
             "registered": f"{len(self.registered)} of {self.photos} photos ({self.mapper} mapper)",
             "points": f"{self.points:,}",

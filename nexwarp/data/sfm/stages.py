@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Generic, TypeVar
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 from nexwarp.data.colmap import read_model
 from nexwarp.data.images import read_image
 from nexwarp.data.lens import pycolmap_module
+from nexwarp.data.sfm.panoramas import cut_panoramas, find_panoramas, rig, view_groups
 from nexwarp.data.sfm.photos import (
     InputPhoto,
     affordable_threads,
@@ -25,14 +26,13 @@ from nexwarp.data.sfm.photos import (
     read_each,
     read_photos,
 )
-from nexwarp.data.sfm.report import EstimatedCamera, Overlaps, SfmOptions, SfmReport, advise, left_out
+from nexwarp.data.sfm.report import EXHAUSTIVE_UP_TO, EstimatedCamera, Overlaps, SfmOptions, SfmReport, advise, left_out
 from nexwarp.io.files import one_line
 
 if TYPE_CHECKING:
     import pycolmap
 
 JPEG_QUALITY = 95  # of undistorted JPEG photos; other formats are lossless
-EXHAUSTIVE_UP_TO = 150  # photos: 11,175 pairs, a quarter of an hour on two cores
 TILE = 16  # photos; the pairs of two tiles are matched together, so that their features stay in memory
 MATCH_BLOCK = 16  # pairs that are matched together
 MIN_MODEL = 3  # photos of a model
@@ -56,6 +56,8 @@ class Stages:
     observe: Observer
     seconds: dict[str, float] = field(default_factory=dict)
     decoders: int = 1  # threads that may each hold a photo
+    views: dict[str, str] = field(default_factory=dict)  # name of a panorama's view -> name of the panorama
+    known: set[int] = field(default_factory=set)  # ids of the views' cameras
     readable: Path = field(init=False)  # folder that pycolmap reads: `photos`, or links and upright copies of them
 
     def __post_init__(self) -> None:
@@ -74,10 +76,13 @@ class Stages:
     def run(self, names: Sequence[str]) -> SfmReport:
         """Reconstruct the photos of these names, and return the report."""
         pycolmap_module().logging.minloglevel = ONLY_FATAL
+        names = self._cut(names)
         given = len(names)
         with self._stage("reading", given) as done:
             photos, skipped = self._read(names, done)
-            groups = camera_groups(self.photos, photos, self.options.cameras)
+            plain = [photo for photo in photos if photo.name not in self.views]
+            groups = camera_groups(self.photos, plain, self.options.cameras)
+            groups += view_groups([photo for photo in photos if photo.name in self.views])
         names = [photo.name for photo in photos]
         with self._stage("features", len(names)) as done:
             self._import(groups)
@@ -85,8 +90,7 @@ class Stages:
         sequential = self.options.matching == "sequential" or (
             self.options.matching == "auto" and len(names) > EXHAUSTIVE_UP_TO
         )
-        count = len(names)
-        pairs = sequential_pairs(count, self.options.overlap) if sequential else exhaustive_pairs(count)
+        pairs = self._pairs(names, sequential)
         with self._stage("matching", len(pairs)) as done:
             self._match(names, pairs, done)
             overlaps = self._overlaps(len(pairs), sequential)
@@ -97,7 +101,7 @@ class Stages:
             sizes = self._undistort(models[0], done)
         with self._stage("checking", len(registered)) as done:
             self._check(done)
-        blurred, repeated = judged(photos)
+        blurred, repeated = judged(plain) if plain else ([], [])
         return SfmReport(
             photos=given,
             registered=[name for name in names if name in set(registered)],
@@ -117,6 +121,7 @@ class Stages:
             blurred=blurred,
             repeated=repeated,
             skipped=skipped,
+            panoramas=len(set(self.views.values())),
         )
 
     @contextmanager
@@ -126,6 +131,27 @@ class Stages:
         yield lambda done: self.observe(title, min(done, total), total)
         self.observe(title, total, total)
         self.seconds[title] = time.perf_counter() - start
+
+    def _cut(self, names: Sequence[str]) -> list[str]:
+        """Replace panoramas by views of them; return the names of all photos."""
+        panoramas = find_panoramas(self.photos, names)
+        if not panoramas:
+            return list(names)
+        folder = self.folder / "views"
+        with self._stage("cutting panoramas", len(panoramas)) as done:
+            origins = cut_panoramas(self.photos, names, panoramas, folder, done)
+        self.photos = self.readable = folder
+        self.views = {view: name for view, name in origins.items() if view != name}
+        return list(origins)
+
+    def _pairs(self, names: Sequence[str], sequential: bool) -> list[tuple[int, int]]:
+        """Return the pairs of photos to compare, by index: of panoramas, all views of one with all of the other."""
+        places: dict[str, list[int]] = {}  # a panorama is one, as any other photo is
+        for index, name in enumerate(names):
+            places.setdefault(self.views.get(name, name), []).append(index)
+        members, count = list(places.values()), len(places)
+        pairs = sequential_pairs(count, self.options.overlap) if sequential else exhaustive_pairs(count)
+        return [pair for one, other in pairs for pair in product(members[one], members[other])]
 
     def _read(self, names: Sequence[str], done: Callable[[int], None]) -> tuple[list[InputPhoto], dict[str, str]]:
         """Decode the photos, and prepare them for pycolmap if any is turned or converted."""
@@ -145,7 +171,7 @@ class Stages:
         reader, single = pycolmap.ImageReaderOptions(), pycolmap.CameraMode.SINGLE
         for group in groups:
             names = [photo.name for photo in group]
-            reader.camera_model = camera_model(group, self.options)
+            reader.camera_model = "PINHOLE" if names[0] in self.views else camera_model(group, self.options)
             run_stage("features", partial(pycolmap.import_images, self.database, self.readable, single, names, reader))
         by_name = {photo.name: group for group in groups for photo in group}
         with open_database(self.database) as database:
@@ -157,6 +183,9 @@ class Stages:
                         camera.params[index] = median(focals)
                 camera.has_prior_focal_length = bool(focals)
                 database.update_camera(camera)
+            if self.views:
+                self.known = {image.camera_id for image in database.read_all_images() if image.name in self.views}
+                pycolmap.apply_rig_config([rig()], database)
 
     def _extract(self, names: Sequence[str], done: Callable[[int], None]) -> None:
         pycolmap = pycolmap_module()
@@ -256,6 +285,7 @@ class Stages:
         options.num_threads = options.mapper.num_threads = self.threads
         options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self.options.seed
         options.min_model_size = MIN_MODEL
+        options.constant_cameras, options.ba_refine_sensor_from_rig = self.known, False
         registered = 0
 
         def first_pair() -> None:
@@ -288,6 +318,7 @@ class Stages:
         options.num_threads = options.mapper.num_threads = self.threads
         options.random_seed = options.mapper.random_seed = self.options.seed
         options.min_model_size = MIN_MODEL
+        options.mapper.refine_sensor_from_rig = False
         folder = self.folder / "global"
         folder.mkdir()
         return run_stage("mapping", lambda: pycolmap.global_mapping(self.database, self.readable, folder, options))
