@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from nexwarp.data import load_scene
 from nexwarp.data.colmap import read_model
 from nexwarp.data.lens import FACES
-from nexwarp.data.sfm import SfmOptions, reconstruct
+from nexwarp.data.sfm import SfmOptions, process
 from nexwarp.data.sfm.panoramas import cut_panoramas, find_panoramas, is_closed, rig
 
 WIDTH, ROOM, TEXELS = 768, 2.0, 512
@@ -111,7 +111,7 @@ def test_cameras_of_panoramas_and_photos_come_back(walls: np.ndarray, tmp_path: 
         poses[f"x{i}.png"] = turn, place
         shown = room(walls, place, pinhole(320)[40:280] @ turn)
         Image.fromarray(shown).save(tmp_path / "photos" / f"x{i}.png")
-    report = reconstruct(tmp_path / "photos", tmp_path / "scene", SfmOptions(camera_model="simple_pinhole"))
+    report = process(tmp_path / "photos", tmp_path / "scene", options=SfmOptions(camera_model="simple_pinhole"))
     assert report.panoramas == 5 and len(report.registered) == report.photos == 33
     assert {camera.params[0] for camera in report.cameras if camera.model == "PINHOLE"} == {round(WIDTH / np.pi) / 2}
     photos = read_model(tmp_path / "scene", tmp_path / "scene" / "images").photos

@@ -22,7 +22,7 @@ from nexwarp.data.capture import Capture
 from nexwarp.data.colmap import read_model
 from nexwarp.data.images import copy_upright, decodable_formats, is_turned
 from nexwarp.data.lens import pycolmap_module
-from nexwarp.data.sfm import SfmOptions, reconstruct
+from nexwarp.data.sfm import SfmOptions, process
 from nexwarp.data.sfm.photos import InputPhoto, affordable_threads, camera_groups, list_photos
 from nexwarp.data.sfm.report import Overlaps, advise, components, left_out
 from nexwarp.data.sfm.stages import Stages, exhaustive_pairs, sequential_pairs
@@ -160,14 +160,14 @@ def test_the_report_is_about_the_scene(made):
 
 
 def test_the_same_photos_give_the_same_bits(made, photos, tmp_path):
-    reconstruct(photos, tmp_path / "again", dataclasses.replace(PINHOLE, threads=1))
+    process(photos, tmp_path / "again", options=dataclasses.replace(PINHOLE, threads=1))
     ours, theirs = snapshot(tmp_path / "again"), snapshot(made)
     del ours["sfm.json"], theirs["sfm.json"]  # they hold seconds
     assert ours == theirs
 
 
 def test_the_global_mapper_finds_the_cameras_too(photos, arc, tmp_path):
-    report = reconstruct(photos, tmp_path / "scene", dataclasses.replace(PINHOLE, mapper="global"))
+    report = process(photos, tmp_path / "scene", options=dataclasses.replace(PINHOLE, mapper="global"))
     assert report.mapper == "global" and len(report.registered) == VIEWS
     assert_cameras_agree(read_model(tmp_path / "scene", tmp_path / "scene" / "images"), arc.viewmats, within=0.01)
 
@@ -251,7 +251,7 @@ def test_distortion_is_found_and_taken_out(arc, tmp_path):
         channels = [map_coordinates(image[..., c], [rows, columns], order=1, mode="nearest") for c in range(3)]
         bent[name] = np.stack(channels, axis=-1).reshape(image.shape)
     folder = write_photos(tmp_path / "bent", bent)
-    report = reconstruct(folder, tmp_path / "scene", SfmOptions(camera_model="simple_radial"))
+    report = process(folder, tmp_path / "scene", options=SfmOptions(camera_model="simple_radial"))
     assert len(report.registered) == VIEWS
     assert report.cameras[0].params[3] == pytest.approx(K1, abs=0.03)
     assert_cameras_agree(read_model(tmp_path / "scene", tmp_path / "scene" / "images"), arc.viewmats, within=0.01)
@@ -309,7 +309,7 @@ def test_photos_turned_by_exif_give_the_cameras_of_upright_ones(made, arc, tmp_p
     for name, orientation in zip(("view 6.png", "view 8.png", "view 10.png"), TURNED, strict=True):
         save_turned(folder / name, arc.images[name], orientation)
     assert stored(folder / "view 6.png")[0].shape == (WIDTH, HEIGHT, 3)
-    reconstruct(folder, tmp_path / "scene", dataclasses.replace(PINHOLE, threads=1))
+    process(folder, tmp_path / "scene", options=dataclasses.replace(PINHOLE, threads=1))
     scene = tmp_path / "scene"
     assert not any(file.is_symlink() for file in scene.rglob("*"))
     assert {(scene / "sparse/0" / n).read_bytes() == (made / "sparse/0" / n).read_bytes() for n in SPARSE} == {True}
@@ -485,7 +485,7 @@ def test_an_interrupt_leaves_nothing(stage, photos, tmp_path, monkeypatch):
             signal.raise_signal(signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
-        reconstruct(photos, tmp_path / "new" / "scene", PINHOLE, observe=observe)
+        process(photos, tmp_path / "new" / "scene", options=PINHOLE, observe=observe)
     assert seen[-1] == stage and not list(tmp_path.iterdir())
 
 
@@ -571,7 +571,7 @@ def quick(monkeypatch, arc, tmp_path):
 
     def make(fault: str = "pass", scene: str = "new/scene", **options: Any) -> None:
         monkeypatch.setattr(processing, "CHILD", (sys.executable, "-c", STAND_IN.format(fault=fault)))
-        reconstruct(folder, tmp_path / scene, PINHOLE, **options)
+        process(folder, tmp_path / scene, options=PINHOLE, **options)
 
     return make
 

@@ -1,6 +1,6 @@
 """Structure from motion with pycolmap on the CPU: from photos or a video to a COLMAP scene."""
 
-from nexwarp.data.sfm.process import process, reconstruct
+from nexwarp.data.sfm.process import process
 from nexwarp.data.sfm.report import SfmOptions, SfmReport
 
-__all__ = ["SfmOptions", "SfmReport", "process", "reconstruct"]
+__all__ = ["SfmOptions", "SfmReport", "process"]

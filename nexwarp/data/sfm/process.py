@@ -29,7 +29,7 @@ from filelock import FileLock, Timeout
 from nexwarp import errors
 from nexwarp.data.sfm.frames import FrameChoice, check_frames, take_frames
 from nexwarp.data.sfm.photos import SECOND, list_photos
-from nexwarp.data.sfm.report import EstimatedCamera, SfmOptions, SfmReport
+from nexwarp.data.sfm.report import EstimatedCamera, Link, SfmOptions, SfmReport
 from nexwarp.data.sfm.stages import PYCOLMAP, Observer, Stages
 from nexwarp.errors import NexwarpError, SceneError, StorageError
 from nexwarp.io.files import make_folders, one_line, remove_empty
@@ -134,18 +134,6 @@ def process(
     return report
 
 
-def reconstruct(
-    photos: str | os.PathLike[str],
-    scene: str | os.PathLike[str],
-    options: SfmOptions | None = None,
-    *,
-    overwrite: bool = False,
-    observe: Observer = lambda stage, done, total: None,
-) -> SfmReport:
-    """Make a scene of a folder of photos; as `process`, which also takes videos."""
-    return process(photos, scene, options=options, overwrite=overwrite, observe=observe)
-
-
 def source_identity(source: Path) -> dict[str, Json]:
     """Return name, size and time of a video, or of all photos of a folder, by which a scene tells its source."""
     photos = [source / name for name in list_photos(source)[0]] if source.is_dir() else []
@@ -212,6 +200,8 @@ def _in_child(order: Order, scene: Path, observe: Observer) -> SfmReport:
         nested = {
             "cameras": [EstimatedCamera(**camera) for camera in report["cameras"]],
             "sizes": [tuple(size) for size in report["sizes"]],
+            "separate": [Link(**link) for link in report["separate"]],
+            "contradictions": [Link(**link) for link in report["contradictions"]],
             "frames": report["frames"] and FrameChoice(**report["frames"]),
         }
         return SfmReport(**(report | nested))
