@@ -88,7 +88,7 @@ class Train:
     overwrite: Flag_ = False
     """Replace the run; files of others stay."""
     checkpoint_every: Annotated[int | None, option("N", "a tenth of all")] = None
-    """Iterations between checkpoints."""
+    """Steps between checkpoints."""
     view: Flag_ = False
     """Show the training in the browser (extra viewer)."""
     host: Host_ = "127.0.0.1"

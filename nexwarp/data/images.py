@@ -14,6 +14,7 @@ import torch
 
 from nexwarp.errors import FormatError
 from nexwarp.io.files import one_line
+from nexwarp.io.pictures import display_light, exr_size, load_deep, load_exr_colors, to_uint8
 
 if TYPE_CHECKING:
     import PIL.Image
@@ -31,6 +32,7 @@ WIDTH, HEIGHT, BITS, PHOTOMETRIC, ORIENTATION, SAMPLE_FORMAT = 256, 257, 258, 26
 WHITE_IS_ZERO, UNSIGNED = 0, 1
 MAKE, MODEL, EXIF_IFD = 271, 272, 0x8769  # EXIF tags
 EXIF_ERRORS = (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.error)  # of PIL, for damaged EXIF
+EXR, DEEP = ".exr", (".png", ".tif", ".tiff")  # suffixes of files of linear light, and of those of up to 16 bits
 COPY_QUALITY = 97  # of upright copies of JPEG files
 
 
@@ -118,6 +120,8 @@ def _check_numbers(path: Path, image: "PIL.Image.Image") -> None:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image in pixels as stored, from its header; errors are those of `read_image`."""
+    if path.suffix.lower() == EXR and path.is_file():
+        return exr_size(path)
     with quiet_pillow(), _opened(path) as image:
         tags = getattr(image, "tag_v2", None)
         return image.size if tags is None else (int(tags[WIDTH]), int(tags[HEIGHT]))
@@ -167,16 +171,30 @@ def _full_range(image: "PIL.Image.Image", bits: int, inverted: bool) -> "PIL.Ima
     return Image.fromarray((65535 - values if inverted else values).astype(np.uint16))
 
 
-def read_image(path: Path) -> torch.Tensor:
+def read_image(path: Path, white: float | None = None) -> torch.Tensor:
     """Read a photo (H, W, 3) uint8 sRGB as COLMAP does: without EXIF orientation, grey repeated, alpha dropped.
+
+    With `white` the file holds linear light, of which this value becomes white; what is brighter is clipped. The
+    largest number of 8 or 16 bits a channel is 1. OpenEXR files hold linear light always, with a `white` of 1 if None.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file cannot be decoded, is truncated, holds numbers of unknown range (floats, signed or 32-bit
-            integers), or has more than 178 megapixels.
+            integers), or has more than 178 megapixels; or PyAV is missing for a PNG or TIFF file of linear light.
     """
-    with _loaded(path) as image:
-        return torch.from_numpy(_to_rgb(image))
+    if white is None and path.suffix.lower() != EXR:
+        with _loaded(path) as image:
+            return torch.from_numpy(_to_rgb(image))
+    width, height = image_size(path)
+    if width * height > MAX_PIXELS:
+        raise ValueError(f"{path}: expected an image of at most {MAX_PIXELS // 10**6} megapixels, got more")
+    if path.suffix.lower() == EXR:
+        linear = torch.from_numpy(load_exr_colors(path))
+    elif path.suffix.lower() in DEEP:
+        linear = torch.from_numpy(load_deep(path).astype(np.float32) / 65535)
+    else:
+        linear = read_image(path).float() / 255
+    return to_uint8(display_light((linear / (white or 1.0)).clamp(0, 1)))
 
 
 def copy_upright(path: Path, target: Path) -> torch.Tensor:
@@ -203,8 +221,10 @@ def copy_upright(path: Path, target: Path) -> torch.Tensor:
     return torch.from_numpy(pixels)
 
 
-def read_transparent(path: Path) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Read a photo as `read_image`, and its (H, W) uint8 alpha; None if the file has no transparency."""
+def read_transparent(path: Path, white: float | None = None) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Read a photo as `read_image`, and its (H, W) uint8 alpha; None if the file has none, or holds linear light."""
+    if white is not None or path.suffix.lower() == EXR:
+        return read_image(path, white), None
     with _loaded(path) as image:
         if not image.has_transparency_data:
             return torch.from_numpy(_to_rgb(image)), None

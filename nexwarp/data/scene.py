@@ -32,7 +32,7 @@ from nexwarp.data.capture import (
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.depth_files import with_depths
 from nexwarp.data.depth_fit import fit_depths
-from nexwarp.data.images import quiet_pillow
+from nexwarp.data.images import EXR, quiet_pillow
 from nexwarp.data.in_memory import as_bytes, make_cloud, near_origin, split_views
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.ply import read_ply
@@ -100,6 +100,8 @@ class SceneSource:
     """Follow symbolic links out of SCENE."""
     skip_missing: Flag_ = False
     """Go on without photos that do not exist."""
+    linear: Annotated[float | None, option("WHITE", "")] = None
+    """Photos are of linear light; this value is white."""
     exclude: Annotated[tuple[str, ...], option("NAME ...", "")] = ()
     """Leave photos out, by name or pattern (*.png)."""
 
@@ -167,6 +169,7 @@ class Scene:
             transparent and no colour was asked for.
         origin: (3,) float64, world coordinates of the origin of the frame of cameras and points; zeros, except for
             scenes that are far from their world's origin. A position in the world is `origin` + the local one.
+        white: linear light that is white in the photos, sRGB of the linear light of their files; None for others.
         random_background: whether training was asked to put each photo on a colour of its own instead, which
             `View.alpha` allows; `background` is white then, for comparisons.
     """
@@ -181,6 +184,7 @@ class Scene:
     path: Path
     background: tuple[float, float, float] | None = None
     random_background: bool = False
+    white: float | None = None
     origin: torch.Tensor = field(default_factory=partial(torch.zeros, 3, dtype=torch.float64))
 
     @property
@@ -328,6 +332,7 @@ def _check_types(source: SceneSource) -> None:
         "follow_links": ((bool,), "True or False"),
         "skip_missing": ((bool,), "True or False"),
         "downscale": ((int,), "an int"),
+        "linear": ((int, float, nothing), "a number"),
         "exclude": ((tuple, list), "a list of names"),
     }
     for name, (kind, expected) in kinds.items():
@@ -343,6 +348,8 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | No
     """Read the scene of a source whose folder is `path`."""
     if source.downscale < 1:
         raise ValueError(f"downscale: expected at least 1, got {source.downscale}")
+    if source.linear is not None and not 0 < source.linear < math.inf:
+        raise ValueError(f"linear: expected a number above 0, got {source.linear}")
     random = isinstance(source.background, str) and source.background == RANDOM
     color = _parse_color("white" if random else source.background)
     with quiet_pillow(), scene_errors():
@@ -366,7 +373,9 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | No
         if color is None and all(view.alpha is None for view in train + held_out):
             background = None  # behind opaque photos there is none to see
         scene = _make_scene(train, held_out, cloud, scale, path, background)
-    return dataclasses.replace(scene, random_background=random)
+        linear = source.linear or any(photo.file.suffix.lower() == EXR for photo in capture.photos)
+        white = float(source.linear or 1) if linear else None
+    return dataclasses.replace(scene, random_background=random, white=white)
 
 
 def _parse_color(color: str | Sequence[float] | None) -> tuple[float, float, float] | None:
@@ -423,7 +432,7 @@ def _read_views(
 ) -> tuple[list[View], list[View]]:
     """Read all photos; return the training views and the test views."""
     alpha_mask = source.masks == ALPHA
-    reader = ViewReader(source.downscale, background, alpha_mask)
+    reader = ViewReader(source.downscale, background, alpha_mask, source.linear)
     photos = with_depths(path, _with_masks(path, capture.photos, source.masks))
     photos = [dataclasses.replace(x, depth=None) if test else x for x, test in zip(photos, tests, strict=True)]
     plans = _map(reader.plan, photos, MAX_READERS)

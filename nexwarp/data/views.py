@@ -98,10 +98,17 @@ class ViewReader:
         downscale: reduce images by this factor, averaging blocks of pixels.
         background: colour behind transparent photos; None drops their alpha.
         alpha_mask: use alpha >= 128 as the mask.
+        white: as of `read_image`.
     """
 
-    def __init__(self, downscale: int, background: tuple[float, float, float] | None, alpha_mask: bool) -> None:
-        self.downscale, self.background, self.alpha_mask = downscale, background, alpha_mask
+    def __init__(
+        self,
+        downscale: int,
+        background: tuple[float, float, float] | None,
+        alpha_mask: bool,
+        white: float | None = None,
+    ) -> None:
+        self.downscale, self.background, self.alpha_mask, self.white = downscale, background, alpha_mask, white
         self._maps, self._lock = lru_cache(KEPT_MAPS)(undistortion), Lock()
 
     def plan(self, photo: Photo) -> list[PlannedView]:
@@ -156,9 +163,9 @@ class ViewReader:
         """Read image, alpha and mask, undistort and reduce them."""
         photo = plan.photo
         if self.background is None and not self.alpha_mask:
-            image, alpha = read_image(photo.file), None
+            image, alpha = read_image(photo.file, self.white), None
         else:
-            image, alpha = read_transparent(photo.file)
+            image, alpha = read_transparent(photo.file, self.white)
         mask = _mask(photo, image, alpha if self.alpha_mask else None)
         if self.background is None or (alpha is not None and bool((alpha == OPAQUE).all())):
             alpha = None

@@ -30,6 +30,7 @@ from nexwarp.cameras.similarity import upright
 from nexwarp.errors import FormatError
 from nexwarp.export.bake import points_on
 from nexwarp.io.files import one_line, write_atomically
+from nexwarp.io.pictures import linear_light
 from nexwarp.io.ply import write_elements
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN
@@ -165,10 +166,9 @@ def save_splats_glb(path: str | os.PathLike[str], splats: Gaussians, cameras: Se
     _check_any(path, splats)
     opacities = splats.logit_opacities.sigmoid()
     display = (BAND_0 * splats.sh[:, 0] + 0.5).clamp(0, 1)
-    linear = torch.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
     attributes = {
         "POSITION": splats.means,
-        "COLOR_0": torch.cat([linear, opacities[:, None]], dim=1),
+        "COLOR_0": torch.cat([linear_light(display), opacities[:, None]], dim=1),
         f"{SPLATTING}:ROTATION": splats.quats.roll(-1, 1),  # xyzw
         f"{SPLATTING}:SCALE": splats.log_scales.exp(),
         f"{SPLATTING}:OPACITY": opacities,

@@ -13,6 +13,7 @@ import torch
 from nexwarp.errors import FormatError, MissingError, StorageError, check_finite
 from nexwarp.io.files import one_line, written_aside
 from nexwarp.io.json_files import parse_json
+from nexwarp.io.video import check_av
 
 ERROR_SCALE = 0.25
 CAPTION_HEIGHT = 16
@@ -120,17 +121,71 @@ def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dic
 
 def load_exr_channel(path: Path) -> np.ndarray:
     """Read the only channel (H, W) of an OpenEXR file as float32; FormatError if it has more, or is damaged."""
+    planes = _channels(path)
+    if len(planes) != 1:
+        raise FormatError(f"{path}: expected one channel, got {len(planes)}")
+    return np.asarray(planes[0][1], np.float32)
+
+
+def exr_size(path: Path) -> tuple[int, int]:
+    """Return width and height of an OpenEXR file's first part, from its header; FormatError if it is damaged."""
+    try:
+        return _check_size(path)
+    except Exception as error:  # OpenEXR raises RuntimeError and other types
+        raise _damaged(path, error) from None
+
+
+def load_exr_colors(path: Path) -> np.ndarray:
+    """Read the channels R, G, B of an OpenEXR file's first part as (H, W, 3) float32; FormatError without them."""
+    planes = dict(reversed(_channels(path)))  # of a name that parts share, the first
+    if not planes.keys() >= {*"RGB"}:
+        raise FormatError(f"{path}: expected the channels R, G and B, got {', '.join(planes)}")
+    colors = np.stack([np.asarray(planes[name], np.float32) for name in "RGB"], axis=-1)
+    if np.isnan(colors).any():
+        raise FormatError(f"{path}: expected numbers, got NaN")
+    return colors
+
+
+def _channels(path: Path) -> list[tuple[str, np.ndarray]]:
+    """Read the names and the pixels (H, W) of all channels of an OpenEXR file."""
     import OpenEXR
 
     try:
         _check_size(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            planes = [channel.pixels for part in file.parts for channel in part.channels.values()]
+            return [(name, channel.pixels) for part in file.parts for name, channel in part.channels.items()]
     except Exception as error:  # OpenEXR raises RuntimeError and other types
-        raise FormatError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({one_line(error)})") from None
-    if len(planes) != 1:
-        raise FormatError(f"{path}: expected one channel, got {len(planes)}")
-    return np.asarray(planes[0], np.float32)
+        raise _damaged(path, error) from None
+
+
+def _damaged(path: Path, error: Exception) -> FormatError:
+    return FormatError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({one_line(error)})")
+
+
+def load_deep(path: Path) -> np.ndarray:
+    """Read a PNG or TIFF file as (H, W, 3) uint16, through PyAV (extra `video`), since PIL keeps 8 bits of 16.
+
+    SettingError: PyAV is missing. FormatError: the file is damaged.
+    """
+    check_av(path)
+    import av
+
+    options = {"format_whitelist": "png_pipe,tiff_pipe", "protocol_whitelist": "file"}
+    try:
+        with av.open(f"file:{path.absolute()}", options=options) as file:
+            return next(file.decode(video=0)).to_ndarray(format="rgb48le")
+    except (av.error.FFmpegError, StopIteration) as error:
+        raise FormatError(f"{path}: expected a whole PNG or TIFF file, could not read it ({one_line(error)})") from None
+
+
+def linear_light(display: torch.Tensor) -> torch.Tensor:
+    """Return the linear light of sRGB values, both 0 to 1."""
+    return torch.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+
+
+def display_light(linear: torch.Tensor) -> torch.Tensor:
+    """Return the sRGB values of linear light: the inverse of `linear_light`."""
+    return torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def _tensor(channels: Mapping[str, np.ndarray]) -> torch.Tensor:
@@ -144,21 +199,23 @@ def _tensor(channels: Mapping[str, np.ndarray]) -> torch.Tensor:
     return torch.from_numpy(np.stack(planes, axis=-1) if len(planes) == 3 else planes[0])
 
 
-def _check_size(path: Path) -> None:
-    """Raise ValueError if the headers announce more pixels than a file of this size can hold."""
+def _check_size(path: Path) -> tuple[int, int]:
+    """Return width and height of the first part; ValueError if the headers announce more than a file can hold."""
     import OpenEXR
 
-    total = 0
+    total, sizes = 0, []
     with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
         for part in file.parts:
             low, high = part.header["dataWindow"]
             width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
             if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
                 raise ValueError(f"expected 1 to {MAX_SIDE} pixels a side, got {width}x{height}")
+            sizes.append((width, height))
             total += width * height * 4 * len(part.header["channels"])
     limit = MAX_RATIO * path.stat().st_size
     if total > limit:
         raise ValueError(f"expected at most {limit:,} bytes of pixels from a file of this size, got {total:,}")
+    return sizes[0]
 
 
 def error_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

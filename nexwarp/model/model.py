@@ -34,7 +34,8 @@ class Model(nn.Module):
         detail_limits: detail limits of the N surfels; None limits nothing.
         options: the options of its rendering.
         meta: further facts, as JSON values: `near` [world units], `scene_scale` [world units], `preset`, `iteration`;
-            `origin` (see the property), where it is not (0, 0, 0); a finished model also has `smooth_sh`.
+            `origin` (see the property), where it is not (0, 0, 0); `white`, the linear light that is white, where
+            photos hold linear light; a finished model also has `smooth_sh`.
 
     Raises:
         TypeError, ValueError: the message names the argument.

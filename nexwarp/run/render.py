@@ -19,7 +19,7 @@ from nexwarp.cameras.ray_camera import MAX_SIDE, RayCamera
 from nexwarp.cameras.similarity import IDENTITY, Similarity
 from nexwarp.data.option import Flag_, option
 from nexwarp.errors import RunError, SettingError
-from nexwarp.io.pictures import save_png, to_uint8
+from nexwarp.io.pictures import linear_light, save_exr, save_png, to_uint8
 from nexwarp.io.video import check_video, video_writer
 from nexwarp.model.buffers import render_buffers, save_buffers
 from nexwarp.model.edit import moved_buffers
@@ -62,6 +62,8 @@ class RenderOrder:
     """Still views to render."""
     buffers: Flag_ = False
     """Also write all buffers (depths, normals, weights ...) of the still views, else of the frames, as OpenEXR."""
+    format: Annotated[str, option("{png,exr}")] = "png"
+    """Files of the pictures; OpenEXR holds linear light, in the unit of the photos' (docs/scenes.md)."""
     size: Annotated[str | None, option("WIDTHxHEIGHT", "that of the photos")] = None
     """Image size in pixels, such as 1920x1080; keeps the vertical field of view."""
     scale: Annotated[float, option("FACTOR")] = 1.0
@@ -94,6 +96,8 @@ class RenderOrder:
                 "--frames: expected together with --path or --video, got --set alone",
             ),
             (self.fps is not None and self.video is None, "--fps: expected together with --video, got no --video"),
+            (self.format not in ("png", "exr"), f"--format: expected png or exr, got {self.format!r}"),
+            (self.buffers and self.format != "png", "--buffers: expected together with --format png, got exr"),
             (self.camera not in kinds, f"--camera: expected {', '.join(kinds)}, got {self.camera!r}"),
             (not 1 <= self.fov <= 360, f"--fov: expected 1 to 360 degrees, got {self.fov:g}"),
             (
@@ -234,6 +238,7 @@ class RenderJob:
         frames = [picture for picture in self.pictures if picture.is_frame]
         asked = {"exposure": self.order.exposure, "order": self.order.order}
         changes = cast(RenderChanges, {name: value for name, value in asked.items() if value is not None})
+        white = w if isinstance(w := model.meta.get("white"), float) else 1.0
         with ExitStack() as stack:
             append = None
             if self.order.video is not None:  # before any rendering, which would be lost if it cannot be written
@@ -247,7 +252,11 @@ class RenderJob:
                 else:
                     image = model.render(projected(self.order, picture.camera), **changes).image
                 pixels = to_uint8(image).cpu()
-                save_png(picture.file, pixels)
+                if self.order.format == "png":
+                    save_png(picture.file, pixels)
+                else:
+                    light = linear_light(image.cpu().clamp_min(0)) * white
+                    save_exr(picture.file.with_suffix(".exr"), {"image": light})
                 if append is not None and picture.is_frame:
                     append(pixels)
                 done()

@@ -119,6 +119,8 @@ class TrainingState:
         facts: dict[str, Json] = {"near": near, "scene_scale": scale, "preset": self.config.preset}
         if self.scene.origin.any():
             facts["origin"] = self.scene.origin.tolist()
+        if self.scene.white is not None:
+            facts["white"] = self.scene.white
         return facts | {"iteration": self.iteration}
 
     def model(self) -> Model:

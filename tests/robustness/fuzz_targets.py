@@ -326,6 +326,18 @@ def _read_depths(folder: Path) -> None:
     assert bool(torch.isfinite(depth).all()) and bool((depth >= 0).all())
 
 
+def _linear(folder: Path) -> list[Files]:
+    folder.mkdir(parents=True, exist_ok=True)
+    save_exr(folder / "a.exr", {"image": torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))})
+    _noise(3).save(folder / "a.png")
+    return [{name: data} for name, data in _files(folder).items()]
+
+
+def _read_linear(folder: Path) -> None:
+    (file,) = folder.iterdir()
+    assert read_image(file, 1.0).dtype == torch.uint8
+
+
 TARGETS = {
     target.name: target
     for target in (
@@ -350,6 +362,7 @@ TARGETS = {
         ),
         FuzzTarget("baked", _baked, _read_baked, (".nxb", ".glb")),
         FuzzTarget("depths", _depths, _read_depths, (".png", ".npy", ".exr", ".bin")),
+        FuzzTarget("linear", _linear, _read_linear, (".exr", ".png")),
         FuzzTarget("exr", _exr, lambda folder: load_exr(folder / "a.exr"), (".exr",)),
     )
 }

@@ -35,7 +35,7 @@ from nexwarp.machine import available_memory
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")  # formats that both PIL and pycolmap 4.2 decode
 CONVERTED = {".heic": "HEIF", ".heif": "HEIF", ".avif": "AVIF", ".webp": "WEBP"}  # to JPEG, where PIL decodes them
-OTHERS = (*CONVERTED, ".gif", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
+OTHERS = (*CONVERTED, ".exr", ".gif", ".jp2", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf")
 FILMS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 SECOND = "another file of that name is used"
 MIN_PHOTOS = 3
