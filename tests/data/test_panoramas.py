@@ -98,6 +98,13 @@ def test_panoramas_are_told_from_photos_of_their_shape(walls: np.ndarray, tmp_pa
     assert find_panoramas(tmp_path, names) == {"closed.jpg", "of their size.jpg", "told.jpg"}
 
 
+def test_the_global_mapper_is_refused(tmp_path: Path) -> None:
+    for name in "abc":
+        Image.fromarray(smooth(rays(64))).save(tmp_path / f"{name}.png")
+    with pytest.raises(ValueError, match="mapper: expected incremental for panoramas, got global"):
+        process(tmp_path, tmp_path.with_suffix(".scene"), options=SfmOptions(mapper="global"))
+
+
 @pytest.mark.slow
 def test_cameras_of_panoramas_and_photos_come_back(walls: np.ndarray, tmp_path: Path) -> None:
     """Five panoramas and three photos of a room: a scene of 33 pinhole views, those of a panorama at one place."""

@@ -143,6 +143,8 @@ class Stages:
         panoramas = find_panoramas(self.photos, names)
         if not panoramas:
             return list(names)
+        if self.options.mapper == "global":  # in what it makes of rigs, most pairs of photos contradict the cameras
+            raise ValueError(f"{self.photos}: mapper: expected incremental for panoramas, got global")
         folder = self.folder / "views"
         with self._stage("cutting panoramas", len(panoramas)) as done:
             origins = cut_panoramas(self.photos, names, panoramas, folder, done)
@@ -261,7 +263,7 @@ class Stages:
         if used == "incremental":
             models = self._mapped(self._incrementally(done))
         missed = not models or models[0].num_reg_images() < len(overlaps.features)
-        if chosen == "global" or (chosen == "auto" and missed):
+        if chosen == "global" or (chosen == "auto" and missed and not self.views):
             try:
                 others = self._mapped(self._globally())
             except ValueError:
@@ -324,7 +326,6 @@ class Stages:
         options.num_threads = options.mapper.num_threads = self.threads
         options.random_seed = options.mapper.random_seed = self.options.seed
         options.min_model_size = MIN_MODEL
-        options.mapper.refine_sensor_from_rig = False
         folder = self.folder / "global"
         folder.mkdir()
         return run_stage("mapping", lambda: pycolmap.global_mapping(self.database, self.readable, folder, options))
