@@ -351,7 +351,7 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | No
     if source.linear is not None and not 0 < source.linear < math.inf:
         raise ValueError(f"linear: expected a number above 0, got {source.linear}")
     random = isinstance(source.background, str) and source.background == RANDOM
-    color = _parse_color("white" if random else source.background)
+    color = parse_color("white" if random else source.background)
     with quiet_pillow(), scene_errors():
         if path.is_file():
             raise NotADirectoryError(f"{path}: expected the folder of a scene, got a file; give {path.parent}")
@@ -378,7 +378,7 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | No
     return dataclasses.replace(scene, random_background=random, white=white)
 
 
-def _parse_color(color: str | Sequence[float] | None) -> tuple[float, float, float] | None:
+def parse_color(color: str | Sequence[float] | None) -> tuple[float, float, float] | None:
     """Three numbers in [0, 1] of a colour's name, of "R,G,B" or of three numbers; None stays None."""
     if color is None:
         return None

@@ -1,6 +1,7 @@
 """Export of run folders to the formats of other programs."""
 
 import importlib.util
+import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from nexwarp.cameras.similarity import IDENTITY
 from nexwarp.data import View
 from nexwarp.data.images import image_size
 from nexwarp.data.option import Flag_, option
-from nexwarp.data.scene import DEMO, SceneSource, demo_folder
+from nexwarp.data.scene import DEMO, SceneSource, demo_folder, parse_color
 from nexwarp.data.transforms import lens_keys
 from nexwarp.errors import RunError, SettingError
 from nexwarp.export.bake import Progress
@@ -36,6 +37,7 @@ from nexwarp.export.splats import (
     save_surfels_ply,
 )
 from nexwarp.export.usd import save_usdz
+from nexwarp.export.web.export import Page, export_web, read_notes
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import JsonObject, write_json
 from nexwarp.model.compact import NOISE, NOISES
@@ -76,6 +78,16 @@ class ExportOrder:
     """Fit what is baked to the model's renderings alone."""
     crop: Annotated[bool, option(None, "glb and usd keep what photos all around look at")] = True
     """Keep all surfels."""
+    title: Annotated[str, option("TEXT", "the scene's name")] = ""
+    """Of web: the heading."""
+    caption: Annotated[str, option("TEXT", "")] = ""
+    """Of web: a text below it."""
+    background: Annotated[str | None, option("COLOUR", "the run's")] = None
+    """Of web: white, black or R,G,B behind the scene."""
+    annotations: Annotated[Path | None, option("FILE.json", "")] = None
+    """Of web: texts at points, a list of {"point": [x, y, z], "text": "..."} in the coordinates of exports."""
+    url: Annotated[str, option("URL", "")] = ""
+    """Of web: address that the page will have; links to it then show a picture."""
     noise: Annotated[float | None, option("X", "8 % of the test views' error")] = None
     """Of compact: noise that its pictures may have, of 1; files with more are smaller."""
     max_extent: Annotated[float, option("X")] = MAX_EXTENT
@@ -101,6 +113,15 @@ class ExportOrder:
             raise SettingError(f"--voxel, --far: expected together with --format mesh, got --format {self.format}")
         if self.format != "usd" and self.collision:
             raise SettingError(f"--collision: expected together with --format usd, got --format {self.format}")
+        texts = [self.title, self.caption, self.background, self.annotations, self.url]
+        if self.format != "web" and any(text not in ("", None) for text in texts):
+            names = "--title, --caption, --background, --annotations, --url"
+            raise SettingError(f"{names}: expected together with --format web, got --format {self.format}")
+        if not re.fullmatch(r"(https?://[^\s/]+\S*)?", self.url):
+            raise SettingError(f"--url: expected an address that begins with https://, got {self.url!r:.60}")
+        parse_color(self.background)
+        if self.annotations is not None:
+            read_notes(self.annotations)
         package, extra = PACKAGES.get(self.format, ("torch", ""))
         if importlib.util.find_spec(package) is None:
             need = f"--format {self.format}: needs the package {package}, found none"
@@ -177,10 +198,8 @@ def _export(
     # What is baked learns from no test view, not even from its pose.
     seen: Views = photos or ([*opened.cameras.get(TRAIN, {}).values()] if views else [])
     if order.format == "web":
-        from nexwarp.export.web.export import export_web
-
-        model, page, title = opened.model.to(device), order.out or files[0], opened.title or "nexwarp"
-        return export_web(model, views, page, seen, quality=order.quality, title=title, progress=observe)
+        model, out, page = opened.model.to(device), order.out or files[0], _page(opened, order)
+        return export_web(model, views, out, seen, quality=order.quality, page=page, progress=observe)
     if order.format == "cameras":
         _export_cameras(opened, *files)
     elif order.format == "mesh":
@@ -196,6 +215,18 @@ def _export(
     else:
         _export_geometry(opened, order, files, list(views.values()), seen, device, observe)
     return files
+
+
+def _page(opened: OpenedModel, order: ExportOrder) -> Page:
+    """Return what a page says, its notes moved from the coordinates of exports to those of the model."""
+    frame = opened.frame
+    origin = np.array(opened.model.origin if opened.model.origin and frame.is_identity else (0.0, 0.0, 0.0))
+    back = frame.inverse()
+    notes = () if order.annotations is None else read_notes(order.annotations)
+    moved = tuple(replace(note, point=tuple(back.points(np.array(note.point) - origin).tolist())) for note in notes)
+    metres = None if frame.scale == 1.0 else frame.scale
+    color = parse_color(order.background)
+    return Page(order.title or opened.title or "nexwarp", order.caption, color, moved, order.url, metres)
 
 
 def _export_geometry(

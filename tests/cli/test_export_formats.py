@@ -35,6 +35,33 @@ def test_a_finished_run_becomes_a_web_page(finished, capsys):
     assert "<title>tiny</title>" in (finished / "page" / "index.html").read_text()
 
 
+def test_notes_are_in_the_coordinates_of_exports(finished, tmp_path, monkeypatch, capsys):
+    """Also where an edit moves and scales them; a headset then shows the scene at that scale."""
+    notes = tmp_path / "notes.json"
+    notes.write_text('[{"point": [1, 2, 3], "text": "a door"}]')
+    export = ["export", str(finished), "--format", "web", "--device", "cpu", "--annotations", str(notes)]
+    assert cli.main([*export, "--title", "A <house>", "--background", "white", "--url", "http://x.y/"]) == 0
+    page = (finished / "export" / "scene.html").read_text()
+    assert '[{"point": [1.0, 2.0, 3.0], "text": "a door"}]' in page and "<h1>A &lt;house&gt;</h1>" in page
+    assert 'content="http://x.y/scene.preview.jpg"' in page and 'theme-color" content="#ffffff' in page
+    assert cli.main(["edit", str(finished), "--origin", "1", "0", "-2"]) == 0
+    assert cli.main(["edit", str(finished), "--scale", "2.5"]) == 0
+    pages = []
+
+    def export_web(*_, page, **__):
+        pages.append(page)
+        return [tmp_path / "x"]
+
+    monkeypatch.setattr("nexwarp.run.export.export_web", export_web)
+    opened = open_model(finished)
+    export_run(opened, ExportOrder("web", finetune=False, annotations=notes))
+    (page,) = pages
+    moved = opened.frame.points(np.array(page.notes[0].point))
+    assert moved.tolist() == pytest.approx([1, 2, 3]) and page.notes[0].point != (1, 2, 3) and page.metres == 2.5
+    notes.write_text('[{"point": [1, 2, 3]}]')
+    refused(capsys, export, f"{notes}: entry 1: text")
+
+
 def test_a_finished_run_becomes_gltf_usd_and_spz(finished, monkeypatch, capsys):
     pytest.importorskip("trimesh")
     refused(capsys, ["export", str(finished), "--format", "glb", "--device", "cpu"], "scene.glb", "opacity above 0.3")

@@ -19,8 +19,8 @@ LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
 @torch.no_grad()
-def encode_baked(baked: Baked, cameras: Mapping[str, Camera]) -> dict[str, bytes]:
-    """Return the files of a baked scene, content by name."""
+def encode_baked(baked: Baked, cameras: Mapping[str, Camera], facts: Mapping[str, object] = {}) -> dict[str, bytes]:
+    """Return the files of a baked scene, content by name; `facts` are those of `encode_scene`."""
     model, layout = baked.model, baked.layout
     picture, scale = encode_picture(baked.atlas)
     harmonics, ranges = encode_harmonics(baked.surfels)
@@ -40,7 +40,7 @@ def encode_baked(baked: Baked, cameras: Mapping[str, Camera]) -> dict[str, bytes
         **{name: scene[name] for name in ("exposures",) if name in scene},
         "shN": harmonics,
     }
-    header = scene_header(bare, scene, cameras, "") | {
+    header = scene_header(bare, scene, cameras, facts) | {
         "atlas": {"file": ATLAS_FILE, "width": layout.width, "height": layout.height, "scale": scale},
         "sh_ranges": ranges,
     }

@@ -61,17 +61,17 @@ def encode_scene(
     cameras: Mapping[str, Camera],
     *,
     quality: str = "quantised",
-    title: str = "",
+    facts: Mapping[str, object] = {},
     poster: bytes | None = None,
 ) -> bytes:
     """Return the content of a scene file of a quality, with cameras by name; of more than 200, every n-th is kept.
 
-    `poster` is a JPEG picture that is shown until the scene is loaded.
+    `facts` are the "title" and "metres" of FORMAT.md; `poster` is a JPEG picture, shown until the scene is loaded.
     """
     if quality not in QUALITIES:
         raise SettingError(f"--quality: expected {' or '.join(QUALITIES)}, got {quality!r:.60}")
     arrays = scene_arrays(model)
-    header = scene_header(model, arrays, cameras, title) | {"quality": quality}
+    header = scene_header(model, arrays, cameras, facts) | {"quality": quality}
     if quality == "quantised":
         arrays = quantised(arrays)
     if header["texture"]:
@@ -140,7 +140,7 @@ def joined_file(
 
 
 def scene_header(
-    model: Model, arrays: Mapping[str, np.ndarray], cameras: Mapping[str, Camera], title: str
+    model: Model, arrays: Mapping[str, np.ndarray], cameras: Mapping[str, Camera], facts: Mapping[str, object]
 ) -> dict[str, object]:
     """Return the header of a model and its `scene_arrays`, without quality and sections."""
     options, exposures, means = model.options, model.exposures, arrays["means"]
@@ -153,7 +153,9 @@ def scene_header(
     header: dict[str, object] = {
         "format_version": FORMAT_VERSION,
         "generator": "nexwarp",
-        "title": title,
+        "title": "",
+        "metres": None,
+        **facts,
         "surfels": len(means),
         "sh_coefficients": arrays["sh"].shape[1],
         "chunk": quantise.CHUNK,

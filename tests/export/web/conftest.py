@@ -9,7 +9,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.export.bake import bake
-from nexwarp.export.web.export import page_files
+from nexwarp.export.web.export import Page, page_files
 from tests.export.web import support
 from tests.export.web.support import CHROMIUM, FLAGS, WEBGPU, PageTab
 from tests.scenes import make_surfels, make_texture, random_scene
@@ -37,7 +37,7 @@ def model(cameras) -> nw.Model:
 def site(model, cameras) -> dict[str, bytes]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nexwarp.export.web.export.bake", functools.partial(bake, steps=10))
-        return page_files(model, cameras, title="Two & <three>")
+        return page_files(model, cameras, page=Page(title="Two & <three>"))
 
 
 @pytest.fixture

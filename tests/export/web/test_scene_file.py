@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.export.web.export import INDEX, export_web, one_file, static_files
+from nexwarp.export.web.export import one_file, static_files
 from nexwarp.export.web.quantise import CHUNK, encode_chunks, encode_limits, encode_quats, morton_order
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene, scene_arrays
 from nexwarp.kernels import sh
@@ -26,7 +26,7 @@ from tests.reference.collect import rotations
 @cache
 def content_of(quality: str = "quantised") -> bytes:
     model, camera = web_model()
-    return encode_scene(model, named_cameras(camera), quality=quality, title="a & b", poster=b"picture")
+    return encode_scene(model, named_cameras(camera), quality=quality, facts={"title": "a & b"}, poster=b"picture")
 
 
 def test_a_full_file_holds_every_bit():
@@ -111,7 +111,7 @@ def test_an_empty_scene(quality):
 
 def test_numbers_of_the_header_are_those_of_the_scene():
     model, camera = web_model(options=RenderOptions(max_hits=3, sh_degree=2))
-    header, _ = read_sections(encode_scene(model, named_cameras(camera), title="a & b", poster=b"picture"))
+    header, _ = read_sections(encode_scene(model, named_cameras(camera), facts={"title": "a & b"}, poster=b"picture"))
     assert header["surfels"] == 60 and header["title"] == "a & b"
     cameras = header["cameras"]
     assert [entry["name"] for entry in cameras] == ["a.png", "b.png"]
@@ -199,17 +199,6 @@ def test_the_page_names_no_other_server():
     for text in [page, *texts]:
         found = re.findall(r"(?:https?:)?//[a-z0-9.-]+\.[a-z]{2,}[^\s\"']*", text)
         assert [url for url in found if "www.w3.org" not in url] == []  # names of XML, not addresses
-
-
-def test_titles_are_text(tmp_path, monkeypatch):
-    monkeypatch.setattr("nexwarp.export.web.export.bake", lambda *_, **__: None)
-    monkeypatch.setattr("nexwarp.export.web.export.encode_baked", lambda *_: {})
-    model, camera = web_model(5)
-    files = export_web(model, named_cameras(camera), tmp_path / "page", title="<b>R&D</b>")
-    assert {file.relative_to(tmp_path / "page").as_posix() for file in files} == {*static_files(), SCENE_FILE}
-    index = (tmp_path / "page" / INDEX).read_text(encoding="utf-8")
-    assert "&lt;b&gt;R&amp;D&lt;/b&gt;" in index and "<b>R&D" not in index and "__TITLE__" not in index
-    assert read_sections((tmp_path / "page" / SCENE_FILE).read_bytes())[0]["surfels"] == 5
 
 
 @pytest.mark.parametrize("name", ["shaders/common.wgsl", "baked_shaders.js"])

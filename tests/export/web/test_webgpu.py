@@ -197,7 +197,6 @@ def test_modes_show_the_buffers_of_the_heaviest_hit(tab, default):
     hit = expected.ids[..., :1] >= 0
     names = {"ids": "ids", "normals": "normal"}  # in the viewer
     pictures = {mode: _values(expected, model.surfels, camera, Settings(mode=name)) for mode, name in names.items()}
-    pictures["alpha"] = expected.alpha[..., None].expand(*hit.shape[:2], 3)
     for mode, picture in pictures.items():
         shown = tab.render(camera, mode=mode)["image"]
         assert_close(shown, picture.contiguous(), kind="value", name=mode, allow_flips=FLIPS)

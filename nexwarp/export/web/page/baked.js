@@ -8,7 +8,7 @@ import {BAKED, SceneError, SceneReader} from "nexwarp/scene.js";
 import {QUADS_FRAGMENT, QUADS_VERTEX, RESOLVE_FRAGMENT, RESOLVE_VERTEX} from "nexwarp/baked_shaders.js";
 
 export const BAKED_FILE = "baked.nxb";
-const MODES = ["image", "plain", "ids", "depth", "normals", "alpha"];
+const MODES = ["image", "plain", "ids", "depth", "normals"];
 const GEOMETRY_TEXELS = 8; // of a surfel
 const SURFELS_PER_ROW = 128;
 

@@ -179,8 +179,6 @@ void main() {
     color = x.a > 0.0 ? viridis(clamp((x.r / x.a - span.x) / max(span.y - span.x, 1e-12), 0.0, 1.0)) : vec3(0.0);
   } else if (mode == 4) {
     color = length(color) > 0.0 ? normalize(color) * 0.5 + 0.5 : vec3(0.0);
-  } else if (mode == 5) {
-    color = vec3(x.a);
   }
   result = vec4(color, max(x.a, cover));
 }

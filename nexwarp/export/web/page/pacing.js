@@ -9,7 +9,6 @@ const REDUCED = 0.7; // below this resolution, the texture is evaluated more coa
 export class Pacing {
     constructor() {
         this.scale = 0.5; // until frames have been timed
-        this.fixed = null; // a resolution that the user has chosen
         this.milliseconds = null;
         this.changed = -Infinity;
         this.times = []; // of frames while moving, as at half the resolution
@@ -27,7 +26,6 @@ export class Pacing {
 
     // What renderers take for the next frame.
     get options() {
-        if (this.fixed !== null) return {resolutionScale: this.fixed};
         if (!this.moving) return {resolutionScale: 1};
         const slow = this.scale < REDUCED;
         return {resolutionScale: this.scale, textureScale: slow ? 0.5 : 1, leastWeight: slow ? 1 / 64 : 0};
@@ -42,7 +40,6 @@ export class Pacing {
     // Learn from a frame. The time is about proportional to the number of pixels, with a part that is not.
     took(milliseconds, {resolutionScale, textureScale}) {
         this.milliseconds = this.milliseconds === null ? milliseconds : 0.7 * this.milliseconds + 0.3 * milliseconds;
-        if (this.fixed !== null) return;
         const moving = textureScale !== undefined;
         if (moving && this.framesPerSecond === null) {
             this.times.push(milliseconds * (0.5 / resolutionScale) ** 2);

@@ -32,11 +32,8 @@ function isInteger(value, low, high) {
 }
 
 function areNumbers(values, count, low = -1e30, high = 1e30) {
-    return (
-        Array.isArray(values) &&
-        values.length === count &&
-        values.every((x) => typeof x === "number" && x >= low && x <= high)
-    );
+    const inside = (x) => typeof x === "number" && x >= low && x <= high;
+    return Array.isArray(values) && values.length === count && values.every(inside);
 }
 
 function isObject(value) {

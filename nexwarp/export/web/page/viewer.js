@@ -3,6 +3,7 @@
 import {BAKED_FILE, BakedRenderer} from "nexwarp/baked.js";
 import {FOV, Pose, basisOf} from "nexwarp/camera.js";
 import {Controls} from "nexwarp/controls.js";
+import {Notes} from "nexwarp/notes.js";
 import {Pacing} from "nexwarp/pacing.js";
 import {Renderer, isWeak} from "nexwarp/renderer.js";
 import {SceneError} from "nexwarp/scene.js";
@@ -17,9 +18,7 @@ const MODES = {
     textured: "texture alone",
     ids: "surfels",
     depth: "depth",
-    weights: "weight of the heaviest",
     normals: "normals",
-    alpha: "opacity",
 };
 const FLIGHT_MILLISECONDS = 700; // from one camera to another
 const LINK_MILLISECONDS = 400; // after the last change, before the address follows
@@ -187,6 +186,8 @@ class Viewer {
         this.#pose = this.start_;
         this.#readLink();
         this.controls = new Controls(this.stage, this);
+        const lookAt = point => this.#flyTo(this.pose.lookingAt(point));
+        this.notes = new Notes(JSON.parse(element("notes").textContent), element("labels"), lookAt);
         this.#settings(header);
         addEventListener("hashchange", () => this.#readLink());
         new ResizeObserver(() => this.#resize()).observe(this.stage);
@@ -216,10 +217,6 @@ class Viewer {
         element("exposure-label").hidden = !exposures;
         element("exposure").onchange = event => {
             this.exposure = event.target.checked ? "photos" : "mean";
-            this.#changed();
-        };
-        element("quality").onchange = event => {
-            this.pacing.fixed = event.target.value === "auto" ? null : Number(event.target.value);
             this.#changed();
         };
         const buttons = {previous: "[", next: "]", home: "Home", fly: "v", link: "l", full: "f", more: ",", help: "?"};
@@ -386,7 +383,7 @@ class Viewer {
             if (!this.dirty && !refine) continue;
             this.dirty = false;
             const options = this.saving ? {resolutionScale: 1} : this.pacing.options;
-            this.refined = options.resolutionScale === 1 || this.pacing.fixed !== null ? "full" : "coarse";
+            this.refined = options.resolutionScale === 1 ? "full" : "coarse";
             this.drawing = this.#draw(options).catch(error => this.#fail(error));
             await this.drawing;
             this.drawing = null;
@@ -397,6 +394,7 @@ class Viewer {
         const camera = this.#pose.camera(this.canvas.width, this.canvas.height, this.near);
         const {mode, exposure} = this;
         const {milliseconds} = await this.renderer.render(camera, {...options, mode, exposure});
+        this.notes.place(camera);
         if (this.saving) await this.#download();
         if (++this.frames === 1) {
             element("poster").classList.add("gone");

@@ -18,9 +18,7 @@ const MODE_PLAIN: u32 = 1u;
 const MODE_TEXTURED: u32 = 2u;
 const MODE_IDS: u32 = 3u;
 const MODE_DEPTH: u32 = 4u;
-const MODE_WEIGHTS: u32 = 5u;
-const MODE_NORMALS: u32 = 6u;
-const MODE_ALPHA: u32 = 7u;
+const MODE_NORMALS: u32 = 5u;
 
 struct Frame {
     row0: vec4f,  // world to camera, by rows

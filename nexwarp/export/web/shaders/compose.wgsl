@@ -83,10 +83,6 @@ fn compose(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
     let p = xy.y * frame.size.x + xy.x;
     let plain = colors[p];
     let mode = frame.counts.z;
-    if (mode == MODE_ALPHA) {
-        image[p] = vec4f(vec3f(plain.w), 1.0);
-        return;
-    }
     if (mode >= MODE_IDS) {
         var shown = vec3f(0.0);
         let id = ids[p * SLOTS];
@@ -96,8 +92,6 @@ fn compose(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
             } else if (mode == MODE_DEPTH) {
                 let ends = frame.limits.yz;
                 shown = scale_color((depths[p * SLOTS] - ends.x) / (ends.y - ends.x));
-            } else if (mode == MODE_WEIGHTS) {
-                shown = scale_color(weights[p * SLOTS]);
             } else {
                 let n = rotate_back(records[u32(id) * RECORD + 2u].xyz);
                 shown = 0.5 + 0.5 * select(n, -n, records[u32(id) * RECORD + 3u].w > 0.0);
