@@ -107,6 +107,28 @@ class BakedScene:
         image = image + (1 - alpha)[..., None] * color
         return image if self.exposures is None else image * self.exposures.factors(camera)
 
+    @torch.no_grad()
+    def overdraw(self, camera: Camera) -> float:
+        """Return how many quads a pixel of a camera lies in, by 32 x 32 pixels: what a GPU shades, most of it unseen.
+
+        A surfel's quad, two triangles, is the rectangle around its hits of at least 1/255.
+        """
+        camera = camera.to(self.texels.device)
+        shape = antialiased(self.shape, camera, self.limits)
+        records = ops.project(*shape, torch.zeros_like(shape.means), camera.viewmat.to(shape.means)).records
+        x, y = (((torch.arange(32) + 0.5) / 32 * size).to(records) for size in (camera.width, camera.height))
+        rays = torch.cartesian_prod((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+        rays = torch.nn.functional.pad(rays, (0, 1), value=1.0).T
+        quads = 0
+        for across, along, facing, last in (part.unbind(1) for part in records.split(4096)):
+            limits = 2 * (255 * across[:, 3:]).log().clamp_min(0)
+            cosines = facing[:, :3] @ rays
+            inside = last[:, 3:] / cosines > camera.near
+            for axis, gammas in ((across, along[:, 3:]), (along, facing[:, 3:])):
+                inside &= (axis[:, :3] @ rays / cosines).abs() < limits.pow(0.5 / gammas)
+            quads += int(inside.sum())
+        return quads / rays.shape[1]
+
 
 def card_scene(
     geometry: tuple[torch.Tensor, torch.Tensor, torch.Tensor],

@@ -329,6 +329,8 @@ def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], 
         }
         if weights_file().is_file():
             figures[name]["lpips"] = fmean(value for each in pictures if (value := lpips_vgg(*each)) is not None)
+    overdraw = fmean(scene.overdraw(motion.camera(view.camera)) for view in views)
+    figures["drawn"] = {"triangles": 2 * len(scene.boxes), "overdraw": overdraw}
     return figures
 
 
@@ -339,7 +341,9 @@ def _line(figures: Figures, views: int, size: int, cropped: bool) -> str:
         for metric, digits, unit in (("psnr", 2, " dB"), ("lpips", 3, ""))
     )
     where = " where nothing was cropped" if cropped else ""
-    return f"test PSNR{where}: {psnr}, {views} views; {size / 1e6:.1f} MB" + (f"; LPIPS: {lpips}" if lpips else "")
+    drawn = f"{figures['drawn']['triangles']:,} triangles, a pixel in {figures['drawn']['overdraw']:.1f} quads"
+    line = f"test PSNR{where}: {psnr}, {views} views; {size / 1e6:.1f} MB; {drawn}"
+    return line + (f"; LPIPS: {lpips}" if lpips else "")
 
 
 def _noise(opened: OpenedModel) -> float:

@@ -200,7 +200,10 @@ def test_an_export_learns_from_training_photos_alone(finished, tmp_path):
     assert results["test"][0] == files and results["test"][1] != [line]
     assert results["train"][0] != files
     psnr = read_metrics(finished)["psnr"]
-    assert re.fullmatch(rf"test PSNR: [\d.]+ dB baked, {psnr:.2f} dB neural, 2 views; [\d.]+ MB", line)
+    drawn = figures["drawn"]
+    counts = f"{drawn['triangles']:,} triangles, a pixel in {drawn['overdraw']:.1f} quads"
+    assert re.fullmatch(rf"test PSNR: [\d.]+ dB baked, {psnr:.2f} dB neural, 2 views; [\d.]+ MB; {counts}", line)
+    assert drawn["triangles"] == 2 * len(open_model(finished).model.surfels) and drawn["overdraw"] > 0
     assert figures["neural"]["psnr"] == pytest.approx(psnr, abs=1e-3) and set(figures["baked"]) == {"psnr", "ssim"}
     assert f"{figures['baked']['psnr']:.2f} dB baked" in line
     without, lines = baked_files(finished, finetune=False)

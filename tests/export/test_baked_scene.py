@@ -1,6 +1,7 @@
 """Baked files read back: the drawing against every surfel at every pixel in float64, and the files' round trips."""
 
 import dataclasses
+import math
 import re
 import struct
 
@@ -16,6 +17,7 @@ from nexwarp.export.glb import make_cards, save_glb
 from nexwarp.export.web.baked import BAKED_FILE
 from nexwarp.export.web.export import one_file, page_files
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
+from nexwarp.model.surfels import Activated
 from nexwarp.ops.atlas import Cut
 from tests.export.web import support
 from tests.export.web.support import as_stored, psnr, ring
@@ -223,3 +225,22 @@ def test_a_gpu_draws_what_the_cpu_draws(form):
         images.append((image.detach().cpu(), present(texels.grad).cpu()))
     assert_close(images[1][0], images[0][0], kind="value", name="image")
     assert_close(images[1][1], images[0][1], kind="gradient", name="texels")
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0])
+def test_overdraw_is_the_area_of_the_quads(turn):
+    """Of surfels across the ray, also turned about it; those behind the camera, or too faint, have none."""
+    count, depth, gamma, opacity = 5, 2.0, 1.3, 0.5
+    quats = torch.tensor([torch.tensor(turn / 2).cos(), 0.0, 0.0, torch.tensor(turn / 2).sin()]).repeat(count, 1)
+    means = torch.tensor([[0.0, 0.0, depth]]).repeat(count, 1)
+    means[3, 2] = -depth
+    opacities = torch.full((count,), opacity)
+    opacities[4] = 1 / 300
+    scales, gammas = torch.tensor([[0.3, 0.25]]).repeat(count, 1), torch.full((count, 2), gamma)
+    shape = Activated(means, quats, scales, opacities, gammas)
+    zeros = torch.zeros(count, 4)
+    scene = BakedScene(shape, torch.zeros(2, 2, 4), zeros, zeros, (torch.zeros(count, 1, 3), torch.zeros(count, 0, 3)))
+    camera = nw.Camera(torch.eye(4), torch.tensor([[90.0, 0, 50], [0, 70, 40], [0, 0, 1]]), 100, 80)
+    reach = (2 * math.log(255 * opacity)) ** (0.5 / gamma)
+    area = (2 * reach * 0.3 * 90 / depth) * (2 * reach * 0.25 * 70 / depth)
+    assert scene.overdraw(camera) == pytest.approx(3 * area / (100 * 80), rel=0.08)

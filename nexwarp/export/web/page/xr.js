@@ -49,6 +49,7 @@ function placeOf({pose, start_: start, renderer: {header}}) {
 
 function drawEyes({renderer, near}, head, layer, place, seeThrough) {
     const eyes = head.views.map(view => {
+        view.requestViewportScale?.(view.recommendedViewportScale); // fewer pixels where the device is too slow
         const part = layer.getViewport(view), {width, height} = part, p = view.projectionMatrix;
         const K = [(p[0] * width) / 2, (p[5] * height) / 2, ((1 - p[8]) * width) / 2, ((1 + p[9]) * height) / 2];
         return {part, camera: {viewmat: viewmatOf(view.transform, place), K, width, height, near}};
