@@ -11,6 +11,11 @@ export class Pacing {
         this.scale = 0.5; // until frames have been timed
         this.milliseconds = null;
         this.changed = -Infinity;
+        this.measure();
+    }
+
+    // Measure the frame rate anew.
+    measure() {
         this.times = []; // of frames while moving, as at half the resolution
         this.measured = 0; // milliseconds of these
     }

@@ -47,7 +47,7 @@ function grouped(threads, size = 256) {
 
 // WebGPU, but on a phone, a GPU that shares the CPU's memory, or the CPU: the baked scene is faster there.
 export async function isWeak() {
-    const adapter = await navigator.gpu?.requestAdapter({ powerPreference: "high-performance" });
+    const adapter = await navigator.gpu?.requestAdapter({ powerPreference: "high-performance" }).catch(() => null);
     const phone = matchMedia("(pointer: coarse)").matches && Math.min(screen.width, screen.height) < 600;
     return Boolean(adapter) && (phone || isSoftware(adapter.info) || INTEGRATED.test(nameOf(adapter.info)));
 }

@@ -97,6 +97,7 @@ class Viewer {
         if (failure) throw failure;
         this.#firstPicture();
         this.state = "ready";
+        this.pacing.measure(); // anew, since frames before had no texture
         this.dirty = true;
         element("loading").hidden = true;
         this.#announce("The scene is loaded.");
@@ -143,7 +144,7 @@ class Viewer {
     // Where the first second of frames is too slow, the baked scene takes over, if there is one.
     #measure() {
         const rate = this.pacing.framesPerSecond;
-        if (!this.measuring || rate === null) return;
+        if (!this.measuring || rate === null || this.state !== "ready") return;
         this.measuring = false;
         if (rate >= LEAST_RATE || this.renderer instanceof BakedRenderer) return;
         this.reason = `since the neural texture had ${rate.toFixed(0)} frames a second`;
