@@ -1,5 +1,6 @@
 """The settings and the report of a reconstruction: registered photos, reasons for the others, advice."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, get_args
@@ -83,6 +84,12 @@ class EstimatedCamera:
     photos: int  # number of registered photos that share it
     exif_focal: bool  # whether EXIF gave its initial focal length
 
+    def text(self) -> str:
+        """Its figures in words."""
+        values = " ".join(f"{value:.5g}" for value in self.params)
+        prior = "EXIF prior" if self.exif_focal else "no EXIF focal length"
+        return f"{self.model} {values}, {prior}, {self.photos} photos"
+
 
 @dataclass(frozen=True)
 class Link:
@@ -139,12 +146,11 @@ class SfmReport:
             "overlapping pairs": f"{self.matched_pairs:,} of {self.pairs:,} compared ({self.matching})",
             "undistorted photos": ", ".join(f"{width}x{height}" for width, height in self.sizes[:LISTED]),
         }
-        for index, camera in enumerate(self.cameras[:LISTED]):
-            prior = "EXIF prior" if camera.exif_focal else "no EXIF focal length"
-            values = " ".join(f"{value:.5g}" for value in camera.params)
-            rows[f"camera {index + 1}"] = f"{camera.model} {values}, {camera.photos} photos, {prior}"
-        if len(self.cameras) > LISTED:
-            rows["more cameras"] = str(len(self.cameras) - LISTED)
+        cameras = Counter(camera.text() for camera in self.cameras)
+        for index, (text, count) in enumerate(list(cameras.items())[:LISTED]):
+            rows[f"camera {index + 1}"] = text if count == 1 else f"{count} of {text} each"
+        if len(cameras) > LISTED:
+            rows["more cameras"] = str(len(cameras) - LISTED)
         if len(self.models) > 1:
             rows["models"] = f"{', '.join(map(str, self.models))} photos; the largest is kept"
         times = ", ".join(f"{stage} {value:.0f}" for stage, value in self.seconds.items())
