@@ -170,7 +170,8 @@ def _cropped(opened: OpenedModel, report: Callable[[str], object]) -> OpenedMode
     if not has_cameras or _regions(opened) or (crop := subject_crop(opened)) is None:
         return opened
     rest = edited(opened, crop)
-    size = " x ".join(f"{x:.3g}" for x in np.ptp(rest.frame.points(rest.model.surfels.means.detach().numpy()), axis=0))
+    centres = rest.frame.points(rest.model.surfels.means.detach().cpu().numpy())
+    size = " x ".join(f"{x:.3g}" for x in np.ptp(centres, axis=0))
     count = f"{opened.kept.sum() - rest.kept.sum():,} of {opened.kept.sum():,}"
     report(f"{count} surfels around the subject are left out (--no-crop keeps them); the others span {size}")
     return rest
