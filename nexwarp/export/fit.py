@@ -81,9 +81,10 @@ def fit(
         loss = errors.mean() if window.mask is None else (errors * window.mask[..., None]).mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        for x in trained.values():
-            _keep_nonzero_rows(x)
-        optimizer.step()
+        with torch.sparse.check_sparse_tensor_invariants(enable=False):  # without a warning that they are not checked
+            for x in trained.values():
+                _keep_nonzero_rows(x)
+            optimizer.step()
         schedule.step()
         if scene.harmonics is None:
             with torch.no_grad():
@@ -96,9 +97,7 @@ def _keep_nonzero_rows(parameter: torch.Tensor) -> None:
     """Replace a parameter's gradient by a sparse one of the rows that are not 0."""
     if (grad := parameter.grad) is not None and grad.numel():
         rows = grad.reshape(len(grad), -1).any(1).nonzero()[:, 0]
-        parameter.grad = torch.sparse_coo_tensor(
-            rows[None], grad[rows], grad.shape, check_invariants=False, is_coalesced=True
-        )
+        parameter.grad = torch.sparse_coo_tensor(rows[None], grad[rows], grad.shape, is_coalesced=True)
 
 
 def _drawn(scene: BakedScene, trained: dict[str, torch.Tensor], share: float | None) -> BakedScene:

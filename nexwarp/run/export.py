@@ -319,11 +319,11 @@ def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], 
 
     def shown(camera: Camera) -> torch.Tensor:
         image = scene.render(motion.camera(camera), background=model.options.background)
-        return image if exposures is None else image * exposures.factors(camera)
+        return image if exposures is None else image * exposures.factors(camera.to(device))
 
     figures: Figures = {}
     for name, render in (("baked", shown), ("neural", model.render_image)):
-        pictures = [(render(view.camera.to(device)), view.image, view.mask) for view in views]
+        pictures = [(render(view.camera).cpu(), view.image, view.mask) for view in views]
         figures[name] = {
             "psnr": fmean(psnr(*each) for each in pictures),
             "ssim": fmean(ssim(*each) for each in pictures),
