@@ -116,7 +116,7 @@ def test_links_of_transforms_stay_in_the_scene(tmp_path, key):
 def test_missing_photos_are_all_named_at_once(tmp_path, kind):
     path = make_scene(tmp_path)
     if kind == "nerfstudio":
-        size = {"w": WIDTH, "h": HEIGHT, "cx": None, "cy": None}
+        size: dict[str, Any] = {"w": WIDTH, "h": HEIGHT, "cx": None, "cy": None}
         room.write_transforms(path, room.transforms([f"images/{i:02d}.png" for i in range(10)], **size))
         shutil.rmtree(path / "sparse")
     for name in ("03.png", "07.png"):
