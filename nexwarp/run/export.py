@@ -59,6 +59,7 @@ READ = ("web", "glb")  # of these, those that can be read back
 Figures = dict[str, dict[str, float]]  # metrics on test views, of what was baked and of the model
 GREY_LEVEL = 1 / 255
 COLLISION_VOXELS = 48  # along the scene's longest side
+FAR_AROUND = 10.0  # so many times the subject, what lies around an object is left out
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows
 
 
@@ -76,7 +77,9 @@ class ExportOrder:
     """Of glb, usd: mask cuts surfels out, which all programs draw; blend is closer to photos, in those that sort."""
     finetune: Annotated[bool, option(None, "to the training photos, where they are")] = True
     """Fit what is baked to the model's renderings alone."""
-    crop: Annotated[bool, option(None, "glb and usd keep what photos all around look at")] = True
+    crop: Annotated[
+        bool, option(None, "glb and usd keep what photos all around look at, if the scene is ten times as large")
+    ] = True
     """Keep all surfels."""
     title: Annotated[str, option("TEXT", "the scene's name")] = ""
     """Of web: the heading."""
@@ -165,15 +168,17 @@ def export_run(
 
 
 def _cropped(opened: OpenedModel, report: Callable[[str], object]) -> OpenedModel:
-    """Return a run, of an object without what lies around it unless it is cropped already; say what is left."""
+    """Return a run, of an object without what lies far around it unless it is cropped already; say what is left."""
     has_cameras = (opened.folder / CAMERAS_FILE).is_file() and opened.cameras.get(TRAIN)
     if not has_cameras or _regions(opened) or (crop := subject_crop(opened)) is None:
         return opened
     rest = edited(opened, crop)
-    centres = rest.frame.points(rest.model.surfels.means.detach().cpu().numpy())
-    size = " x ".join(f"{x:.3g}" for x in np.ptp(centres, axis=0))
+    whole, size = (np.ptp(x.frame.points(x.model.surfels.means.detach().cpu().numpy()), axis=0) for x in (opened, rest))
+    if whole.max() < FAR_AROUND * size.max():
+        return opened
     count = f"{opened.kept.sum() - rest.kept.sum():,} of {opened.kept.sum():,}"
-    report(f"{count} surfels around the subject are left out (--no-crop keeps them); the others span {size}")
+    spans = " x ".join(f"{x:.3g}" for x in size)
+    report(f"{count} surfels around the subject are left out (--no-crop keeps them); the others span {spans}")
     return rest
 
 

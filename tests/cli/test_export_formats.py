@@ -84,7 +84,7 @@ def test_a_finished_run_becomes_gltf_usd_and_spz(finished, monkeypatch, capsys):
 
 
 def test_gltf_of_an_object_holds_the_subject_alone(finished, monkeypatch):
-    """In the new coordinates; unless it is told to hold all, or what was cropped before."""
+    """In the new coordinates, where much lies far around it; unless told to hold all, or what was cropped before."""
     pytest.importorskip("trimesh")
     monkeypatch.setattr("nexwarp.export.glb.CUTOFF", 0.05)  # surfels of a short training are faint
     monkeypatch.setattr("nexwarp.run.edit.subject", lambda cameras: (torch.tensor([0.5, 0, 0]).double(), 1.0))
@@ -98,6 +98,10 @@ def test_gltf_of_an_object_holds_the_subject_alone(finished, monkeypatch):
         file = export_run(open_model(finished), ExportOrder("glb", crop=crop), report=lines.append)[0]
         return load_baked(file).shape.means.numpy()
 
+    with monkeypatch.context() as patch:
+        patch.setattr("nexwarp.run.export.FAR_AROUND", 1e3)
+        assert (np.linalg.norm(exported() - [1, 0, 0], axis=1) > 2.001).any()
+    lines.clear()
     assert (np.linalg.norm(exported() - [1, 0, 0], axis=1) <= 2.001).all()
     size = [float(x) for x in re.findall(r"[\d.]+", lines[0].partition("span")[2])]
     assert lines[0].startswith(f"{(~near).sum()} of {len(near)} surfels") and len(lines) == 2
