@@ -29,7 +29,7 @@ from tests.scene_writers import write_blender, write_points
 pytestmark = pytest.mark.usefixtures("small_preset")
 
 
-LINKS = {"follow_links": False, "skip_missing": False, "linear": None, "exclude": []}
+LINKS: dict[str, object] = {"follow_links": False, "skip_missing": False, "linear": None, "exclude": []}
 
 
 def test_a_run_holds_what_it_should(trained, scene):
