@@ -151,17 +151,17 @@ def export_run(
     fitted = order.format in BAKED and order.finetune and opened.source is not None
     train, test = _photos(opened, device, observe) if fitted else ([], [])
     files = [*_export(opened, order, folder, train, device, observe)]
+    beside = folder.parent if folder.suffix == ".html" else folder
     if test and order.format in READ:
         figures, size = _quality(opened, files, test, device), sum(file.stat().st_size for file in files)
-        report(_line(figures, len(test), size, _regions(opened)))
-        beside = folder.parent if folder.suffix == ".html" else folder
+        report(_line(figures, len(test), size, _is_cropped(opened)))
         known = read_metrics(beside).get("exports")
         files.append(beside / METRICS_FILE)
-        entry = cast(JsonObject, {**figures, "cropped": _regions(opened)})
+        entry = cast(JsonObject, {**figures, "cropped": _is_cropped(opened)})
         write_json(files[-1], {"exports": (known if isinstance(known, dict) else {}) | {files[0].name: entry}})
     # Compact models and cameras say themselves where their frame lies in the world.
     if order.format not in ("compact", "cameras") and any(opened.model.origin or ()) and opened.frame.is_identity:
-        files.append((folder.parent if folder.suffix == ".html" else folder) / ORIGIN_FILE)
+        files.append(beside / ORIGIN_FILE)
         meaning = "world position = origin + exported position"
         write_json(files[-1], {"origin": opened.model.origin, "meaning": meaning})
     return files
@@ -170,7 +170,7 @@ def export_run(
 def _cropped(opened: OpenedModel, report: Callable[[str], object]) -> OpenedModel:
     """Return a run, of an object without what lies far around it unless it is cropped already; say what is left."""
     has_cameras = (opened.folder / CAMERAS_FILE).is_file() and opened.cameras.get(TRAIN)
-    if not has_cameras or _regions(opened) or (crop := subject_crop(opened)) is None:
+    if not has_cameras or _is_cropped(opened) or (crop := subject_crop(opened)) is None:
         return opened
     rest = edited(opened, crop)
     whole, size = (np.ptp(x.frame.points(x.model.surfels.means.detach().cpu().numpy()), axis=0) for x in (opened, rest))
@@ -182,7 +182,7 @@ def _cropped(opened: OpenedModel, report: Callable[[str], object]) -> OpenedMode
     return rest
 
 
-def _regions(opened: OpenedModel) -> bool:
+def _is_cropped(opened: OpenedModel) -> bool:
     """Whether a run is cropped."""
     return any(edit.name in REGIONS for edit in opened.edits)
 
@@ -299,7 +299,7 @@ def _photos(opened: OpenedModel, device: torch.device | str, observe: Progress) 
         groups.append([replace(view, image=image, mask=mask) for view, image, mask in shown])
     cameras = opened.cameras.get(TRAIN, {}) if (opened.folder / CAMERAS_FILE).is_file() else {}
     groups[0] = [replace(view, camera=cameras.get(view.name, view.camera)) for view in groups[0]]
-    if _regions(opened):
+    if _is_cropped(opened):
         models = [model.bare().to(device) for model in (opened.trained, opened.model)]
         groups = [[_masked(view, *models) for view in group] for group in groups]
     return groups[0], [view for view in groups[1] if view.mask is None or view.mask.any()]
