@@ -1,7 +1,7 @@
 """Frames of a baked page by the page's own shaders on the GPU, through EGL instead of a browser.
 
     pip install moderngl
-    python -m benchmarks.bench_page RUN/export --cameras RUN --size 1920x1080
+    python -m benchmarks.page RUN/export --cameras RUN --size 1920x1080
 
 Printed are medians over the run's test cameras: GPU time of a frame, frames a second, and the quads of a pixel that are
 blended (overdraw; each reads the atlas once, bilinearly). The sort of the surfels, which the page's script
@@ -152,7 +152,7 @@ def filling(camera: Camera, width: int, height: int) -> Camera:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.bench_page", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.page", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("page", type=Path, help="page, or its folder")
     parser.add_argument(
         "--cameras", type=Path, required=True, help="run folder, of whose test cameras frames are drawn"
