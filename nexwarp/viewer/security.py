@@ -1,15 +1,16 @@
-"""Who may open the viewer, how many may, and what they may send: all rules of its security.
+"""Who may open the viewer, and what they may send: all rules of its security.
 
 * The Origin, which browsers send with every WebSocket, must be the server's own: "http://" and the Host. Programs that
   are not browsers send none; no page of another server can make them connect.
 * On a loopback address the Host must be "localhost" or a loopback address. A name that somebody lets lead to 127.0.0.1
   (DNS rebinding) is its own Host and Origin, and is refused by this rule.
 * On any other address each request needs the token: in the URL, or in the cookie that the page's response sets.
-* Tabs, connections, the size and rate of messages, and the time to read one are bounded. Messages of other kinds than
-  the viewer's panels and canvas send are dropped: viser's client knows uploads and public tunnels, too.
+* Messages of other kinds than the viewer's panels and canvas send, and large ones, are dropped: viser's client knows
+  uploads and public tunnels, too.
+
+Who passes these rules is trusted: nothing bounds how much a browser asks for.
 """
 
-import asyncio
 import contextlib
 import hmac
 import http
@@ -32,13 +33,7 @@ if TYPE_CHECKING:
     import viser.infra
 
 TOKEN_BYTES = 24  # 192 bits
-MAX_CLIENTS = 32  # browser tabs
-MAX_CONNECTIONS = 128  # TCP connections: clients, pages in transfer, and what has not sent a request yet
 MAX_MESSAGE_BYTES = 2**16  # of one message of a browser; the largest that the panels send has a few hundred
-MESSAGES_A_SECOND = 120.0  # of one client, on average; a browser sends 50 while its camera moves
-BURST = 240  # messages of one client that may come at once
-FLOOD_SECONDS = 5.0  # of more messages than that, after which a client is closed
-SEND_SECONDS = 60.0  # in which a client must have read a message
 CLOSE_SECONDS = 2.0  # in which a client must answer a farewell
 ACCEPTED = {"ViewerCameraMessage", "GuiUpdateMessage", "SceneNodeClickMessage"}
 HEADERS = {
@@ -127,12 +122,10 @@ def _cookie_name(port: int) -> str:
 
 
 class Gate:
-    """Admits requests by the rules of access and up to the largest numbers of connections and clients."""
+    """Admits requests by the rules of access."""
 
     def __init__(self, access: Access) -> None:
         self.access = access
-        self.connections: dict[Connection, None] = {}  # TCP, the oldest first
-        self.clients: set[Connection] = set()  # those of them that are WebSockets
         self.attached = False  # viser's server runs behind this gate
         self.is_open = False  # requests are answered
 
@@ -147,7 +140,6 @@ class Gate:
         ) -> web.serve:
             self.attached = True
             options |= {"max_size": MAX_MESSAGE_BYTES, "close_timeout": CLOSE_SECONDS}
-            options |= {"create_connection": partial(Connection, self)}
             answer = partial(self._answer, process_request)
             return serve(handler, host, port, process_request=answer, **options)  # type: ignore[arg-type]
 
@@ -159,75 +151,19 @@ class Gate:
 
     def _answer(self, pages: Process, connection: ServerConnection, request: Request) -> Response | None:
         """Refuse a request, or answer it with a page, or return None to admit a WebSocket."""
-        assert isinstance(connection, Connection)
         if not self.is_open:
             return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "the viewer is starting: reload this page\n")
         reason = self.access.refusal(request.path, request.headers)
         if reason is not None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
-        connection.is_admitted = True
-        if len(self.clients) >= MAX_CLIENTS:
-            text = f"the viewer serves at most {MAX_CLIENTS} browser tabs: close one of them and reload this page\n"
-            return connection.respond(http.HTTPStatus.SERVICE_UNAVAILABLE, text)
         response = pages(connection, request)
         if response is None:
-            self.clients.add(connection)
             return None
         for name, value in HEADERS.items():
             response.headers[name] = value
         if (cookie := self.access.cookie(request.path, request.headers)) is not None:
             response.headers["Set-Cookie"] = cookie
         return response
-
-
-class Connection(ServerConnection):
-    """A connection that is read slowly if it sends fast, and closed if it goes on to, or does not read."""
-
-    def __init__(self, gate: Gate, *arguments: object, **options: object) -> None:
-        super().__init__(*arguments, **options)  # type: ignore[arg-type]
-        self.gate = gate
-        self.is_admitted = False  # a request of it has passed the rules of access
-        self.sending = 0  # messages that the client has not taken yet
-        self.next_due = self.in_time = 0.0
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take up a TCP connection. If there are too many, drop the oldest that has not sent a valid request."""
-        super().connection_made(transport)
-        connections = self.gate.connections
-        connections[self] = None
-        if len(connections) > MAX_CONNECTIONS:
-            dropped = next((other for other in connections if not other.is_admitted), self)
-            del connections[dropped]  # it is lost later
-            dropped.transport.abort()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Forget a closed connection."""
-        self.gate.connections.pop(self, None)
-        self.gate.clients.discard(self)
-        super().connection_lost(exc)
-
-    async def recv(self, decode: bool | None = None) -> str | bytes:  # type: ignore[override]
-        """Wait for a message. A client that sends too fast waits: its connection is not read in the meantime."""
-        message = await super().recv(decode)
-        now = self.loop.time()
-        self.next_due = max(self.next_due, now - BURST / MESSAGES_A_SECOND) + 1.0 / MESSAGES_A_SECOND
-        # At least a zero: the previous message is handled before the next one is taken.
-        await asyncio.sleep(max(self.next_due - now, 0.0))
-        if self.next_due <= now:
-            self.in_time = now
-        elif now - self.in_time > FLOOD_SECONDS:
-            self.transport.abort()
-        return message
-
-    async def send(self, message: bytes, text: bool | None = None) -> None:  # type: ignore[override]
-        """Send a message; close the connection if it is not read in time."""
-        timer = self.loop.call_later(SEND_SECONDS, self.transport.abort)
-        self.sending += 1
-        try:
-            await super().send(message, text)
-        finally:
-            self.sending -= 1
-            timer.cancel()
 
 
 def accept_only_known(server: "viser.ViserServer") -> None:

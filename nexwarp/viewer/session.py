@@ -247,7 +247,7 @@ class Session:
         state, connection = server._client_state_from_id.get(client), server._live_connections.get(client)
         if state is None or connection is None:
             return 0
-        return len(state.message_buffer.message_from_id) + connection.sending  # type: ignore[attr-defined]
+        return len(state.message_buffer.message_from_id) + (connection.transport.get_write_buffer_size() > 0)
 
     async def _moved(self, camera: "viser.CameraHandle") -> None:
         self._take_over(camera)
