@@ -1,28 +1,22 @@
-"""The quality benchmark: its rows, its trainings from end to end, its tables."""
+"""The quality benchmark: its views, its trainings from end to end, its tables."""
 
 import dataclasses
 import json
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from PIL import Image
 
 import nexwarp as nw
 from benchmarks.quality import curve
 from benchmarks.quality.__main__ import main
-from benchmarks.quality.documents import MISSING, blocks
-from benchmarks.quality.jobs import FOLDS, PEERS, Row, TrainingJob, config_of, scene_of
-from benchmarks.quality.results import Results, read_results, table
+from benchmarks.quality.jobs import FOLDS, Row, TrainingJob, config_of, scene_of
 from benchmarks.timing import ROOT
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.stages import StageRunner
 from tests.narrowing import present
 from tests.scene_writers import write_demo
-
-EXAMPLE, EXPOSED = PEERS[0].name, PEERS[2].name
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +62,7 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
 
 
 @pytest.mark.filterwarnings("ignore:LPIPS is left out")
-def test_a_curve_has_points_at_its_times_and_at_the_end(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_curve_has_points_at_its_times_and_at_the_end(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Teachers' steps count, and what it takes to look does not."""
     clock = iter(range(10_000))  # each reading of the clock is a second later
     monkeypatch.setattr("time.perf_counter", lambda: float(next(clock)))
@@ -87,43 +79,6 @@ def test_a_curve_has_points_at_its_times_and_at_the_end(
         assert any(before < mark <= after for mark in curve.TIMES)
     last = watch.points[-1]["psnr"]
     assert last == pytest.approx(evaluate(model, watch.scene.test)["psnr"])
-    out = tmp_path / "curves.png"
-    curve.draw([{"scene": "tiny", "row": "mine", "size": 60, "curve": watch.points}], out)
-    with Image.open(out) as picture:
-        assert picture.size[0] == 400
-    with pytest.raises(ValueError, match="results: expected trainings with --curve, got none"):
-        curve.draw([], out)
-
-
-def line(scene: str, row: str, size: int, psnr: float, seed: int = 0) -> dict[str, Any]:
-    figures: dict[str, object] = {"psnr": psnr, "ssim": 0.9, "flip": 0.1, "lpips": None, "megabytes": 2.0}
-    facts: dict[str, object] = {"date": "2026-11-25", "device": "H200", "seconds": 5.0}
-    return dataclasses.asdict(TrainingJob(scene, "", row, size, seed, 30_000)) | figures | facts
-
-
-def read(lines: list[dict[str, Any]], path: Path) -> Results:
-    path.write_text("".join(json.dumps(each) + "\n" for each in lines))
-    return read_results([path])
-
-
-def rows_of(text: str) -> dict[str, list[str]]:
-    cells = [[cell.strip() for cell in row.split("|")[1:-1]] for row in text.splitlines() if row.startswith("|")]
-    return {row[0]: row[1:] for row in reversed(cells)}  # of two rows, the first
-
-
-def test_the_best_gsplat_row_of_each_scene_is_the_peer(tmp_path: Path) -> None:
-    lines = [line("fox", "default", 40_000, 32.5), line("fox", "default", 40_000, 32.3, seed=1)]
-    lines += [line("fox", EXAMPLE, 40_000, 31.5), line("fox", EXPOSED, 40_000, 32.0)]
-    lines += [line("saharov", "default", 40_000, 22.0), line("saharov", EXAMPLE, 40_000, 20.0)]
-    results = read(lines, tmp_path / "x.jsonl")
-    tables = blocks(results)
-    own = "32.40, 0.9000, 0.1000"
-    peers = rows_of(tables["peers"])
-    assert peers["fox"] == ["40,000", own, "31.50, 0.9000, 0.1000", "32.00, 0.9000, 0.1000", "+0.40 dB"]
-    assert peers["saharov"][-1] == "+2.00 dB" and peers["train"] == ["40,000", *[MISSING] * 4]
-    assert rows_of(tables["readme"])["fox"] == ["32.40", "0.9000", "0.1000", "2.0", "32.00", "0.9000", "0.1000", "2.0"]
-    assert "H200, 2026-11-25" in tables["readme"]
-    assert "| fox | 40,000 | 30,000 | default | 32.40 ± 0.14 |" in table(results)
 
 
 def test_the_documents_have_the_kept_figures(tmp_path: Path) -> None:
