@@ -28,13 +28,6 @@ from tests.scenes import (
 from tests.tolerances import assert_close, assert_same_ids
 
 
-def test_repeated_renders_are_identical(device: torch.device) -> None:
-    scene, texture = random_scene(device=device), make_texture(device=device)
-    first = draw(scene, texture)
-    for _ in range(3):
-        assert_same(draw(scene, texture), first, (*BUFFERS, "ids"))
-
-
 def test_the_order_of_the_surfels_changes_nothing(device: torch.device) -> None:
     scene, texture = random_scene(device=device), make_texture(device=device)
     permutation = torch.randperm(len(scene["means"])).to(device)

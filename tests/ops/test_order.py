@@ -13,17 +13,9 @@ from nexwarp.model import graphs as frames
 from nexwarp.ops.tiles import Order
 from nexwarp.run.render import PictureJob, RenderJob, RenderOrder
 from tests import scenes
-from tests.render_support import assert_same, draw
 from tests.tolerances import assert_close
 
 ORDERS: tuple[Order, ...] = ("depth", "distance")
-
-
-def test_by_distance_another_surfel_is_in_front():
-    scene = scenes.named_scene("wide", torch.float32, "cpu")
-    by_depth, by_distance = (draw(scene, order=order) for order in ORDERS)
-    assert (by_depth.image - by_distance.image).abs().max() > 0.01
-    assert_same(draw(scene), by_depth)
 
 
 def test_turning_the_camera_changes_no_ray(device):

@@ -1,8 +1,5 @@
 """Steps and frames leave products of matrices to their own kernels: cuBLAS keeps 32 MiB a stream once it is called."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
-
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -21,13 +18,7 @@ class Products(TorchDispatchMode):
         super().__init__()
         self.found: list[str] = []
 
-    def __torch_dispatch__(
-        self,
-        func: Callable[..., Any],
-        types: Sequence[type],
-        args: Sequence[Any] = (),
-        kwargs: Mapping[str, Any] | None = None,
-    ) -> Any:
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         """Note a product, and compute."""
         name = str(func).split(".")[1]
         if name in PRODUCTS:
