@@ -34,28 +34,22 @@ K = torch.tensor([[20.0, 0.0, 8.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]])
 
 BAD_CAMERAS = [
     ("viewmat", ValueError, SHEARED),
-    ("viewmat", ValueError, 2 * torch.eye(4)),
     ("viewmat", ValueError, MIRRORED),
     ("viewmat", ValueError, changed(torch.eye(4), (3, 0), 0.5)),
     ("viewmat", ValueError, changed(torch.eye(4), (1, 3), float("nan"))),
-    ("viewmat", ValueError, torch.eye(3)),
     ("viewmat", TypeError, torch.eye(4).int()),
-    ("viewmat", TypeError, "eye"),
     ("viewmat", ValueError, torch.eye(3).tolist()),
     ("viewmat", TypeError, [[1.0, 0.0], [1.0]]),
     ("K", ValueError, changed(K, (0, 1), 0.5)),
     ("K", ValueError, changed(K, (0, 0), -20.0)),
     ("K", ValueError, changed(K, (0, 2), float("nan"))),
     ("K", ValueError, changed(K, (2, 2), 2.0)),
-    ("K", ValueError, torch.eye(4)),
     ("K", TypeError, 20.0),
     ("width", ValueError, 0),
     ("width", TypeError, 16.0),
     ("height", ValueError, -1),
-    ("height", TypeError, True),
     ("near", ValueError, -0.1),
     ("near", ValueError, float("nan")),
-    ("near", (TypeError, ValueError), "0.1"),
 ]
 
 
@@ -90,20 +84,14 @@ def test_cameras_take_arrays_and_lists(convert: Callable[[torch.Tensor], Any]) -
 BAD_SURFELS = [
     ("means", ValueError, lambda means: means[:, :2]),
     ("means", ValueError, lambda means: changed(means, (2, 1), float("nan"))),
-    ("means", TypeError, lambda means: means.tolist()),
-    ("quats", ValueError, lambda quats: quats[:-1]),
     ("quats", ValueError, lambda quats: torch.where(torch.arange(8)[:, None] == 3, 0.0, quats)),
     ("quats", ValueError, lambda quats: changed(quats, (0, 0), float("inf"))),
     ("scales", ValueError, lambda scales: scales[:, :1]),
     ("scales", ValueError, lambda scales: changed(scales, (4, 1), 0.0)),
     ("scales", TypeError, lambda scales: scales.double()),
-    ("opacities", ValueError, lambda opacities: opacities[:, None]),
     ("opacities", ValueError, lambda opacities: changed(opacities, (1,), 1.5)),
-    ("opacities", ValueError, lambda opacities: changed(opacities, (1,), float("nan"))),
-    ("gammas", ValueError, lambda gammas: gammas[:, 0]),
     ("gammas", ValueError, lambda gammas: changed(gammas, (5, 0), 0.5)),
     ("sh", ValueError, lambda sh: sh[:, :5]),
-    ("sh", ValueError, lambda sh: sh[..., :2]),
     ("sh", ValueError, lambda sh: changed(sh, (7, 15, 2), float("nan"))),
     ("sh", TypeError, lambda sh: sh.half()),
     ("means", ValueError, lambda means: means + torch.zeros(3, requires_grad=True)),  # its graph would be cut
@@ -148,7 +136,6 @@ def test_ends_of_the_ranges(dtype: torch.dtype) -> None:
 
 BAD_TEXTURES = [
     ("levels", ValueError, 0),
-    ("levels", TypeError, 2.5),
     ("table_size", ValueError, 1000),
     ("features", ValueError, 3),
     ("min_resolution", ValueError, 0.0),
@@ -171,16 +158,11 @@ def test_bad_texture(argument: str, error: type[Exception], value: Any) -> None:
 
 BAD_RENDERS = [
     ("max_hits", ValueError, -1),
-    ("max_hits", ValueError, 9),
     ("max_hits", TypeError, 1.5),
     ("sh_degree", ValueError, 7),
-    ("sh_degree", ValueError, -1),
     ("sh_degree", TypeError, "3"),
     ("background", ValueError, (0.0, 0.0)),
-    ("background", ValueError, torch.zeros(4)),
     ("background", (TypeError, ValueError), "black"),
-    ("background", (TypeError, ValueError), None),
-    ("surfels", TypeError, None),
     ("surfels", TypeError, torch.zeros(3, 3)),
     ("texture", TypeError, "texture"),
     ("camera", TypeError, torch.eye(4)),

@@ -204,23 +204,14 @@ def put(name: str, value: torch.Tensor) -> Callable[[dict[str, torch.Tensor], di
         (drop("surfels.means.code"), "surfels.means.code"),
         (drop("texture.grid"), "texture.grid"),
         (put("surfels.shN.code", torch.zeros(1, 2, 3)), "surfels.shN.code"),
-        (put("surfels.sh0.code", torch.zeros(2, 1, 3, dtype=torch.float16)), "surfels.sh0.code"),
         (put("surfels.means", torch.zeros(24, 3)), "surfels.means: expected U8, got F32"),
-        (put("surfels.means", torch.zeros(24, 3, dtype=torch.uint8)), "surfels.means: expected a stream of bytes"),
         (put("surfels.means", torch.zeros(240, dtype=torch.uint8)), "surfels.means: expected an xz stream"),
         (lambda tensors, _: tensors.update({"surfels.sh0": tensors["surfels.sh0"][:-8]}), "surfels.sh0: expected the"),
-        (
-            lambda tensors, _: tensors.update({"surfels.sh0": tensors["surfels.shN"].clone()}),
-            "surfels.sh0: expected the digits",
-        ),
         (lambda _, meta: meta["shapes"].update({"surfels.sh0": [25, 1, 3]}), "surfels.sh0: expected the digits of 75"),
         (lambda _, meta: meta["shapes"].update({"surfels.sh0": [FREE, 300, 3]}), "surfels.sh0: expected at most"),
         (lambda _, meta: meta["shapes"].update({"surfels.sh0": [24, -1, 3]}), "expected the shape of surfels.sh0"),
         (lambda _, meta: meta["shapes"].pop("texture.grid"), "expected the shape of texture.grid, got None"),
-        (lambda _, meta: meta.update(shapes=[3]), "expected the shape of"),
-        (put("surfels.means.code", torch.full((3, 3), 1e30)), "surfels.means"),
         (put("surfels.sh0.code", torch.full((2, 1, 3), float("nan"))), "surfels.sh0"),
-        (lambda _, meta: meta.update(format_version=1), "surfels"),
         (lambda _, meta: meta.update(format_version=2), ": expected I"),
         (lambda _, meta: meta.update(format_version=4), "version 1 to 3, got 4; a newer nexwarp"),
     ],
@@ -244,15 +235,6 @@ def test_the_documented_reader_decodes_a_compact_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(tensors["footprints"], loaded.detail_limits.nearest.numpy())
 
 
-def test_export_writes_a_compact_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = Path(__file__).parents[1] / "old_files" / "0.2.0-69de7c9"
-    assert cli.main(["export", str(run), "--format", "compact", "--out", str(tmp_path)]) == 0
-    file = tmp_path / "compact.safetensors"
-    assert capsys.readouterr().out.split() == [str(file)]
-    assert file.stat().st_size < (run / MODEL_FILE).stat().st_size  # of few surfels, so most of it is header
-    assert len(nw.load(file).surfels) == len(nw.load(run).surfels)
-
-
 def test_exports_of_worse_models_are_smaller(tmp_path: Path) -> None:
     """Noise that adds 0.03 dB to large errors would add more to small ones."""
     run = Path(shutil.copytree(Path(__file__).parents[1] / "old_files" / "0.2.0-69de7c9", tmp_path / "run"))
@@ -262,7 +244,10 @@ def test_exports_of_worse_models_are_smaller(tmp_path: Path) -> None:
         assert cli.main(["export", str(run), "--format", "compact", "--out", str(tmp_path), *options]) == 0
         return (tmp_path / "compact.safetensors").read_bytes()
 
-    usual = nw.load(run).save(tmp_path / "usual.safetensors", compact=True).read_bytes()
+    model = nw.load(run)
+    usual = model.save(tmp_path / "usual.safetensors", compact=True).read_bytes()
     sizes = [len(exported(f'{{"psnr": {psnr}}}')) for psnr in (20, 30, 40)]
     assert sizes == sorted(sizes) and sizes[0] < sizes[2]
     assert exported('{"psnr": null}') == exported('{"psnr": 20}', "--noise", "0.002") == usual
+    assert len(usual) < (run / MODEL_FILE).stat().st_size
+    assert len(nw.load(tmp_path / "compact.safetensors").surfels) == len(model.surfels)

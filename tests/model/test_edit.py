@@ -132,17 +132,12 @@ def test_surfels_of_another_model_are_not_removed():
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("{", "could not parse"),
-        ("[]", "object"),
         ('{"format_version": 2, "edits": []}', "update nexwarp"),
-        ('{"format_version": 1}', "edits"),
         ('{"format_version": 1, "edits": 3}', "edits of a model"),
         ('{"format_version": 1, "edits": [{"name": "paint", "numbers": [1]}]}', "paint"),
-        ('{"format_version": 1, "edits": [{"name": ["box"], "numbers": []}]}', "edits of a model"),
         ('{"format_version": 1, "edits": [{"name": "scale", "numbers": [0]}]}', "scale: expected at least"),
         ('{"format_version": 1, "edits": [{"name": "scale", "numbers": [true]}]}', "numbers"),
         ('{"format_version": 1, "edits": [{"name": "origin", "numbers": [NaN, 0, 0]}]}', "NaN"),
-        ('{"format_version": 1, "edits": [{"name": "origin", "numbers": ["0", 0, 0]}]}', "numbers"),
         ('{"format_version": 1, "edits": [{"name": "box", "numbers": [0, 0, 0, 1, 0, 1]}]}', "lowest"),
         ('{"format_version": 1, "edits": [{"name": "remove", "numbers": [1, -2]}]}', "indices"),
         (json.dumps({"format_version": 1, "edits": [{"name": "level", "numbers": [1.0] * 12}]}), "rotation"),

@@ -3,7 +3,6 @@
 import gc
 import weakref
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,21 +10,14 @@ import torch
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.cameras.cameras_file import save_cameras
-from nexwarp.cli import main as cli
-from nexwarp.data.scene import SceneSource
 from nexwarp.errors import NexwarpError, OutOfMemoryError
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.types import types
 from nexwarp.machine import needed_memory
 from nexwarp.model.buffers import render_buffers
-from nexwarp.model.model_file import save_model
 from nexwarp.ops import _interop, memory, tiles
-from nexwarp.run.folder import RunRecord, create_run
-from nexwarp.train.trainer import Trainer
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
-from tests.trainer_support import small
 
 GIB = 2**30
 CROP = r"render the image in parts \(Camera\.crop\)"
@@ -184,48 +176,6 @@ def test_what_an_error_leaves_is_freed_without_the_garbage_collector(monkeypatch
             assert kept[-1]() is None
     finally:
         gc.enable()
-
-
-def test_a_training_says_what_to_lower_when_a_rendering_is_refused(tiny_scene, monkeypatch):
-    trainer = Trainer(tiny_scene, small(), "cpu")
-    monkeypatch.setattr(memory, "SMALLEST_CHECKED", 1000)
-    monkeypatch.setattr(memory, "available_memory", lambda: 2000)
-    with pytest.raises(OutOfMemoryError, match=r"^out of memory at iteration 1: it needed at least .* lower --max"):
-        trainer.run()
-
-
-# The command
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder that can be rendered, as far as the command looks."""
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    surfels, texture, camera = parts()
-    create_run(folder, RunRecord(SceneSource("scene"), small()))
-    save_model(folder, nw.Model(surfels, texture))
-    save_cameras(folder / "cameras.json", {"train": {"a.png": camera}, "test": {"b.png": camera}})
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("flags", "line"),
-    [
-        (["--size", "100000x100000"], "--size: expected WIDTHxHEIGHT of 1 to 16384 pixels each, got '100000x100000'"),
-        (["--scale", "1e6"], "--scale: expected at most 16384 pixels a side, got 23000000x18000000 with 1e+06"),
-        (
-            ["--size", "16384x16384"],
-            "out of memory: an image of 16384x16384 pixels with K = 2 needs at least 17.0 GiB, of which 8.0 GiB are "
-            "free; render a smaller image, with a lower K, or in parts (Camera.crop)",
-        ),
-    ],
-)
-def test_the_command_refuses_images_that_are_too_large(run, monkeypatch, capsys, flags, line):
-    limit_memory(monkeypatch, torch.device("cpu"), 8 * GIB)
-    before = sorted(run.rglob("*"))
-    assert cli.main(["render", str(run), "--set", "test", "--device", "cpu", *flags]) == 2
-    assert capsys.readouterr().err == f"nexwarp: error: {line}\n"
-    assert sorted(run.rglob("*")) == before
 
 
 # Values and devices
