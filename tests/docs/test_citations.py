@@ -8,8 +8,6 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[2]
 CITED = re.compile(
     r"\b(?:Sec|Eq)(?:tions?|uations?|s)?\b\.?\s*\(?\d+(?:\.\d+)*|(?:paper's|publication's|its)\s+(?:section|Sec\.)\s+\"",
@@ -82,18 +80,3 @@ def test_equations_of_the_method_page_have_their_numbers():
     """The page numbers its equations as the paper does; each number once."""
     tags = re.findall(r"\\tag\{(\d+)\}", (ROOT / "docs" / "method.md").read_text(encoding="utf-8"))
     assert tags == [str(n) for n in range(1, 14)]
-
-
-@pytest.mark.parametrize(
-    ("text", "right"),
-    [
-        ("Densification (paper Sec. 4.3, paper Sec. 8.2).", True),
-        ("Collection pass (paper Sec. 3.2).", False),
-        ("Collection pass (Sec. 4.2).", False),
-        ("fades levels, Delta (paper Eq. 4 and 5)", False),
-        ("Adam's moments (paper Eq. 4)", False),
-    ],
-)
-def test_what_counts_as_a_citation(text, right):
-    found = list(problems("text", text))
-    assert found and any(found) != right

@@ -12,7 +12,6 @@ import pytest
 from notebooks.__main__ import FOLDER, NAMES, execute, pictures, sources
 
 ROOT = FOLDER.parent
-LARGEST = 4_000_000  # bytes, of the whole folder
 HERE = re.compile(r"/(home|root|tmp|work|Users)/")
 
 
@@ -41,10 +40,6 @@ def test_the_first_cell_finds_the_helper_from_any_folder(tmp_path: Path) -> None
         command = [sys.executable, "-c", f"{setup}\nprint(importlib.util.find_spec('figures').origin)"]
         done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
         assert (done.stdout, done.stderr) == (f"{FOLDER / 'figures.py'}\n", ""), folder
-
-
-def test_folder_is_small() -> None:
-    assert sum(path.stat().st_size for path in FOLDER.glob("*.ipynb")) < LARGEST
 
 
 @pytest.mark.parametrize("source", ["assert 1 == 2", "import warnings; warnings.warn('old')"])

@@ -20,10 +20,10 @@ from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
 from nexwarp.model.surfels import Activated
 from nexwarp.ops.atlas import Cut
 from tests.export.web import support
-from tests.export.web.support import as_stored, psnr, ring
+from tests.export.web.support import as_stored, psnr, ring, ring_model
 from tests.narrowing import present
 from tests.reference.collect import rotations
-from tests.scenes import make_camera, make_surfels, make_texture, random_scene
+from tests.scenes import make_camera, make_surfels, random_scene
 from tests.tolerances import assert_close
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -36,13 +36,7 @@ def cameras() -> dict[str, nw.Camera]:
 
 @pytest.fixture(scope="module")
 def model(cameras) -> nw.Model:
-    surfels = make_surfels(random_scene(12, width=64, height=48, seed=3))
-    gains = torch.linspace(-0.3, 0.3, len(cameras))[:, None].expand(-1, 3) * torch.tensor([1.0, 0.5, -0.5])
-    exposures = nw.Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
-    texture = make_texture(residual=True)
-    with torch.no_grad():
-        texture.grid.mul_(0.3)
-    return nw.Model(surfels, texture, exposures, options=nw.RenderOptions(background=(0.1, 0.2, 0.3)))
+    return ring_model(cameras, 12)
 
 
 @pytest.fixture(scope="module")

@@ -223,16 +223,6 @@ def test_an_affine_renderer_shows_large_surfels_as_we_do(tmp_path: Path) -> None
     assert found[0] < 30 and found[1] >= 35, found
 
 
-def test_what_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
-    surfels = make_surfels(random_scene(4))
-    (tmp_path / "file").touch()
-    with pytest.raises(OSError, match="file"):
-        save_surfels_ply(tmp_path / "file" / "a.ply", surfels)
-    with pytest.raises(OSError, match="file"):
-        save_splats_ply(tmp_path / "file" / "a.ply", gaussians(surfels))
-    assert [f.name for f in tmp_path.iterdir()] == ["file"]
-
-
 # Meshes: a fused sphere lies on the sphere, faces outwards and is whole
 
 RADIUS, VOXEL = 1.0, 0.03

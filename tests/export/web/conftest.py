@@ -12,7 +12,6 @@ from nexwarp.export.bake import bake
 from nexwarp.export.web.export import Page, page_files
 from tests.export.web import support
 from tests.export.web.support import CHROMIUM, FLAGS, WEBGPU, PageTab
-from tests.scenes import make_surfels, make_texture, random_scene
 
 
 @pytest.fixture(scope="module")
@@ -23,14 +22,7 @@ def cameras() -> dict[str, nw.Camera]:
 @pytest.fixture(scope="module")
 def model(cameras) -> nw.Model:
     """A small model with everything that a page has to show: exposures, vignetting, detail limits."""
-    surfels = make_surfels(random_scene(40, width=64, height=48, seed=3))
-    gains = torch.linspace(-0.3, 0.3, len(cameras))[:, None].expand(-1, 3) * torch.tensor([1.0, 0.5, -0.5])
-    exposures = nw.Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
-    limits = nw.DetailLimits(torch.full((40,), 0.01), torch.full((40,), 0.04))
-    texture = make_texture(residual=True)
-    with torch.no_grad():
-        texture.grid.mul_(0.3)
-    return nw.Model(surfels, texture, exposures, limits, nw.RenderOptions(background=(0.1, 0.2, 0.3)))
+    return support.ring_model(cameras, 40, nw.DetailLimits(torch.full((40,), 0.01), torch.full((40,), 0.04)))
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from nexwarp.export.bake import Baked
 from nexwarp.export.web.baked import encode_harmonics, encode_picture
 from nexwarp.export.web.quantise import CHUNK
 from nexwarp.model.texture import NEVER
-from tests.scenes import intrinsics, make_camera, make_surfels, random_scene, rigid
+from tests.scenes import intrinsics, make_camera, make_surfels, make_texture, random_scene, rigid
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 WEBGPU = ["--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader"]
@@ -143,6 +143,17 @@ def ring(count: int = 4, width: int = 64, height: int = 48) -> dict[str, nw.Came
         K = intrinsics(0.8 * width, 0.8 * width, width / 2, height / 2).float()
         cameras[f"{i}.png"] = nw.Camera(viewmat, K, width, height)
     return cameras
+
+
+def ring_model(cameras: dict[str, nw.Camera], count: int, limits: nw.DetailLimits | None = None) -> nw.Model:
+    """A small model of the random scene, with a residual texture, and exposures and vignetting of the cameras."""
+    gains = torch.linspace(-0.3, 0.3, len(cameras))[:, None].expand(-1, 3) * torch.tensor([1.0, 0.5, -0.5])
+    exposures = nw.Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
+    texture = make_texture(residual=True)
+    with torch.no_grad():
+        texture.grid.mul_(0.3)
+    surfels = make_surfels(random_scene(count, width=64, height=48, seed=3))
+    return nw.Model(surfels, texture, exposures, limits, nw.RenderOptions(background=(0.1, 0.2, 0.3)))
 
 
 @torch.no_grad()

@@ -73,11 +73,8 @@ def test_what_a_person_writes_is_in_the_page(tmp_path, monkeypatch, out):
         ("{}", "expected a list"),
         ('[{"point": [1, 2, 3], "text": "a"}, 7]', "entry 2: point: expected three numbers"),
         ('[{"point": [1, 2], "text": "a"}]', "entry 1: point: expected three numbers [x, y, z], got [1, 2]"),
-        ('[{"point": [1, 2, true], "text": "a"}]', "entry 1: point"),
-        ('[{"point": [1, 2, 1e400], "text": "a"}]', "entry 1: point"),
         ('[{"point": [1, 2, 1%s], "text": "a"}]' % ("0" * 400), "entry 1: point"),
         ('[{"point": [1, 2, 3], "text": 5}]', "entry 1: text: expected 1 to 500 characters in quotes, got 5"),
-        ('[{"point": [1, 2, 3], "text": " "}]', "entry 1: text"),
     ],
 )
 def test_bad_notes_give_one_line(tmp_path, content, words):
