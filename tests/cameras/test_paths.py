@@ -134,9 +134,6 @@ def row(count: int = 15, bend: float = 0.3) -> list[Camera]:
     return [camera(place, target + (1 - bend) * place) for place in places]
 
 
-# Spiral
-
-
 def test_spiral_winds_within_the_cameras() -> None:
     cameras = row(200)
     path = spiral(cameras, 240)
@@ -186,9 +183,6 @@ def test_paths_take_the_rest_from_the_first_camera(make, cameras_of, device: tor
     for each in path:
         assert each.viewmat.dtype == torch.float32 and each.device.type == device.type
         assert each.K.equal(INTRINSICS.float().to(device)) and (each.width, each.height, each.near) == (64, 48, 0.2)
-
-
-# Interpolation
 
 
 def test_a_path_through_cameras_passes_every_one_in_turn() -> None:
@@ -290,9 +284,6 @@ PARALLEL = "cameras: expected two or more with axes that are not parallel"
 def test_degenerate_cameras_are_refused(make: Callable[..., Any], given: list[Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(*given)
-
-
-# Sizes
 
 
 def test_resized_camera_sees_the_same_from_top_to_bottom() -> None:

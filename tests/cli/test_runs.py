@@ -82,9 +82,6 @@ def test_training_says_what_it_does(scene, tmp_path, capsys):
     assert nw.load(run).options.max_hits == 0
 
 
-# eval, render, info
-
-
 def test_memory_that_ends_while_finishing_costs_no_training(scene, tmp_path, monkeypatch, capsys):
     def full(*_: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. And more")
@@ -200,9 +197,6 @@ def test_info_tells_what_a_run_holds(trained, scene, capsys, monkeypatch):
     for text in (str(scene), f"{metrics['surfels']} (budget 100)", "4 levels of 1,024", f"{size:.1f} MB"):
         assert text in out, text
     assert f"{metrics['psnr']:.2f} dB" in out and f"{metrics['ssim']:.4f}" in out
-
-
-# Scenes in other forms
 
 
 def test_a_blender_scene_through_train_resume_and_eval(tmp_path, capsys):

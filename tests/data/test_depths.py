@@ -219,9 +219,6 @@ def test_maps_that_transforms_json_names(folder: Path, monkeypatch: pytest.Monke
         nw.load_scene(scene)
 
 
-# Their fit to points
-
-
 def seen(values: np.ndarray | None, depths: np.ndarray, points: int = 60, seed: int = 0) -> View:
     """A view with a map of `values`, and with points of which a tenth lie far off its `depths`."""
     rng = np.random.default_rng(seed)

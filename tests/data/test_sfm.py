@@ -122,9 +122,6 @@ def assert_cameras_agree(model: Capture, truth: dict[str, np.ndarray], within: f
     assert np.linalg.norm(turned - theirs[:, :3, :3], ord=2, axis=(1, 2)).max() < within
 
 
-# What comes back
-
-
 def test_cameras_come_back(made, photos, arc):
     assert list_photos(photos) == (list(arc.images), {}), "in the order in which people number them"
     model = read_model(made, made / "images")
@@ -285,8 +282,6 @@ def test_folders_exif_and_a_stray_photo(arc, tmp_path, capsys):
     assert len({photo.lens.params[0] for photo in model.photos}) == 2
 
 
-# Photos of phones
-
 TURNED = {6: 1, 8: -1, 3: 2}  # EXIF orientation: quarter turns to the left from upright to stored pixels
 
 
@@ -373,9 +368,6 @@ def test_portrait_and_landscape_photos_have_a_camera_each(cameras, count):
     assert len(groups) == count and ["a/2.jpg", "a/4.jpg"] in [[photo.name for photo in group] for group in groups]
 
 
-# What is compared
-
-
 def test_pairs_are_compared_once_and_a_walk_is_joined_to_its_start():
     every = exhaustive_pairs(50)
     assert len(every) == len(set(every)) == 50 * 49 // 2 and all(0 <= i < j < 50 for i, j in every)
@@ -384,9 +376,6 @@ def test_pairs_are_compared_once_and_a_walk_is_joined_to_its_start():
     assert (0, 5) not in pairs and (0, 96) not in pairs and all(i < j for i, j in pairs)
     assert set(sequential_pairs(6, 10)) == set(exhaustive_pairs(6))
     assert components("abcdef", [("a", "b"), ("d", "e"), ("e", "f")]) == [{"d", "e", "f"}, {"a", "b"}, {"c"}]
-
-
-# What to do
 
 
 def overlaps(features: dict[str, int], pairs: list[str], sequential: bool = False) -> Overlaps:
@@ -420,9 +409,6 @@ def test_every_photo_left_out_has_its_reason():
         "g": "only 3 features: dark, blurred or without texture",
         "h": "overlaps no registered photo",
     }
-
-
-# Bad input
 
 
 def with_files(**files: Any):
@@ -667,9 +653,6 @@ def test_a_killed_process_leaves_nothing(photos, tmp_path):
     while list(tmp_path.iterdir()):
         assert time.monotonic() < deadline, list(tmp_path.rglob("*"))
         time.sleep(0.01)
-
-
-# Files and memory
 
 
 @pytest.mark.parametrize("name", ["a\x1b[2J.png", "a\nb.png", "b" * 241 + ".png", "c\udcff.png", "link.png"])

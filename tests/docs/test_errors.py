@@ -56,8 +56,6 @@ def test_boundaries_raise_the_family(tmp_path):
         assert "\n" not in str(caught.value)
 
 
-# The terminal
-
 LACKS_MEMORY = "error: out of memory: needed 2.00 GiB; try a smaller image size"
 
 

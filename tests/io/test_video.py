@@ -102,8 +102,6 @@ def test_without_the_extra_it_says_what_to_install(tmp_path: Path, monkeypatch: 
         check_video(tmp_path / "a.mp4", 30.0)
 
 
-# Reading
-
 PATCHES = np.array(
     [[200, 40, 40], [40, 200, 40], [40, 40, 200], [220, 220, 220], [128, 128, 128], [30, 30, 30], [200, 180, 60]]
 )

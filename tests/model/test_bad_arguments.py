@@ -26,8 +26,6 @@ def changed(tensor: torch.Tensor, index: tuple[int, ...], value: float) -> torch
     return tensor
 
 
-# Camera
-
 MIRRORED = torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0]))
 SHEARED = changed(torch.eye(4), (0, 1), 0.01)
 K = torch.tensor([[20.0, 0.0, 8.0], [0.0, 20.0, 8.0], [0.0, 0.0, 1.0]])
@@ -78,8 +76,6 @@ def test_cameras_take_arrays_and_lists(convert: Callable[[torch.Tensor], Any]) -
     made.fill_(0.0)  # a copy: the array of the caller stays
     assert expected.K[0, 0] == 20.0
 
-
-# Surfels
 
 BAD_SURFELS = [
     ("means", ValueError, lambda means: means[:, :2]),
@@ -132,8 +128,6 @@ def test_ends_of_the_ranges(dtype: torch.dtype) -> None:
     assert (surfels.scales > 0).all()
 
 
-# Texture
-
 BAD_TEXTURES = [
     ("levels", ValueError, 0),
     ("table_size", ValueError, 1000),
@@ -153,8 +147,6 @@ def test_bad_texture(argument: str, error: type[Exception], value: Any) -> None:
     nw.NeuralTexture(**good)
     assert_refused(error, argument, nw.NeuralTexture, **(good | {argument: value}))
 
-
-# Render
 
 BAD_RENDERS = [
     ("max_hits", ValueError, -1),

@@ -49,9 +49,6 @@ def no_allocation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launching, "launch", fail)
 
 
-# int32
-
-
 @pytest.mark.usefixtures("no_allocation")
 @pytest.mark.parametrize("size", [(100_000, 100_000), (2**31, 1), (1, 2**31), (46_341, 46_341), (2**27, 1), (2**40, 2)])
 def test_more_pixels_than_int32_counts(size, device):
@@ -82,9 +79,6 @@ def test_rows_that_warp_cannot_address_are_refused():
         _interop.array(wide, types(_interop.real_of(wide)).real)
     single = torch.empty_strided((1, 4), (2**40, 1))
     assert _interop.array(single, types(_interop.real_of(single)).real) is not None
-
-
-# Memory
 
 
 def limit_memory(monkeypatch: pytest.MonkeyPatch, device: torch.device, size: int) -> None:
@@ -176,9 +170,6 @@ def test_what_an_error_leaves_is_freed_without_the_garbage_collector(monkeypatch
             assert kept[-1]() is None
     finally:
         gc.enable()
-
-
-# Values and devices
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), 1e39])

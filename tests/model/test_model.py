@@ -67,9 +67,6 @@ def pure(model: nw.Model, camera: nw.Camera, **parts: Any) -> nw.Rendering:
     return draw(model.surfels, model.texture, camera, model.options, **parts)
 
 
-# What is rendered
-
-
 @pytest.mark.parametrize("saved", ["photos", "mean"])
 @pytest.mark.parametrize("flags", [[], ["--buffers"], ["--exposure", "mean"], ["--exposure", "mean", "--buffers"]])
 def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flags: list[str], saved: Exposure) -> None:
@@ -216,9 +213,6 @@ def test_nothing_is_rendered_twice(monkeypatch: pytest.MonkeyPatch) -> None:
         assert torch.equal(getattr(buffers, name), getattr(out, name)), name
 
 
-# Gradients
-
-
 def test_gradients_are_those_of_the_pure_rendering(device: torch.device) -> None:
     """They reach the camera, the surfels, the texture and the background through exposures and detail limits."""
     camera, found = make_camera(random_scene(1, device=device)), []
@@ -241,9 +235,6 @@ def test_gradients_are_those_of_the_pure_rendering(device: torch.device) -> None
         assert gradient.abs().max() > 0, name
         if device.type == "cpu":
             assert torch.equal(gradient, found[1][name]), name
-
-
-# Copies and files
 
 
 def test_state_dicts_hold_exposures_and_limits(device: torch.device) -> None:
@@ -297,9 +288,6 @@ def test_models_move_as_a_whole(device: torch.device) -> None:
     camera = cameras_of()[0].to(torch.float64)
     image = full_model().render(cameras_of()[0]).image
     torch.testing.assert_close(double.render(camera).image.float(), image, atol=1e-3, rtol=0)
-
-
-# What is refused
 
 
 def test_parts_that_do_not_fit_are_named() -> None:

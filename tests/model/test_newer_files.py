@@ -37,9 +37,6 @@ def change_json(file: Path, change: Callable[[Any], object]) -> None:
     file.write_text(json.dumps(data))
 
 
-# Unknown keys and tensors
-
-
 def test_a_model_with_unknown_keys_and_tensors_loads_the_same(tmp_path: Path) -> None:
     model = tiny_model()
     expected = nw.load(save_model(tmp_path / "old", model))
@@ -102,9 +99,6 @@ def test_a_checkpoint_with_unknown_keys_and_tensors_restores_the_same(tmp_path: 
     resumed = Trainer(tiny_scene, config, "cpu")
     resumed.restore(tmp_path)
     assert_same_state(resumed, done)
-
-
-# Format versions
 
 
 def write_version(kind: str, folder: Path, version: object) -> tuple[Path, Callable[[], object]]:

@@ -146,9 +146,6 @@ def test_extremes_among_others_leave_those_as_they_are(scales: float, opacity: f
         assert torch.equal(getattr(alone, name), getattr(together, name)), name
 
 
-# Sizes
-
-
 @pytest.mark.parametrize(("width", "height"), [(16, 16), (1, 1), (SIDE, 1), (1, SIDE), (SIDE, 8)])
 def test_images_of_any_size(width: int, height: int, device: torch.device) -> None:
     """What a pixel shows does not depend on the image that it is in."""

@@ -57,9 +57,6 @@ def value_of(number: torch.Tensor, expected: float | list[float], name: str) -> 
     assert_close(number, torch.tensor(expected, dtype=torch.float64), kind="value", name=name)
 
 
-# Spherical harmonics
-
-
 def test_basis_is_the_real_form_of_scipys() -> None:
     directions = torch.nn.functional.normalize(torch.randn(50, 3, dtype=torch.float64), dim=-1)
     polar, azimuth = directions[:, 2].acos(), torch.atan2(directions[:, 1], directions[:, 0])
@@ -81,9 +78,6 @@ def test_plain_color_by_hand() -> None:
     value_of(colors[0], [0.5 + 0.28209479177387814, 0.5 + 0.4886025119029199, 0.0], "colors")
     colors = plain_colors(sh, tensor((1.0, 2.0, 7.0)), tensor(1.0, 2.0, 3.0), 0)
     value_of(colors[0], [0.5 + 0.28209479177387814, 0.5, 0.0], "colors at degree 0")
-
-
-# The collection pass
 
 
 def test_one_surfel_by_hand() -> None:
@@ -160,9 +154,6 @@ def test_near_tests_the_depth_of_the_hit() -> None:
         value_of(hits.depths[2, 2], depths, "depths")
 
 
-# The hash grid
-
-
 def test_hash_by_hand() -> None:
     """(3, -2, 0) maps to (5, 4, 0); 4 x 2654435761 = 2027808452 modulo 2^32; xor 5 is 2027808449."""
     corners = torch.tensor([[3, -2, 0], [0, 0, 0], [-1, 1, 7], [123456, -654321, 2**30]])
@@ -189,9 +180,6 @@ def test_encode_at_a_corner_and_between() -> None:
         ]),
     ])  # fmt: skip
     assert_close(features, expected, kind="value", name="features")
-
-
-# The whole
 
 
 def make_field(sh_degree: int = 3) -> Texture:

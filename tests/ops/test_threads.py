@@ -33,9 +33,6 @@ def assert_identical(results: list[dict[str, torch.Tensor]]) -> None:
         assert all(torch.equal(first, other[name]) for other in results[1:]), name
 
 
-# Threads
-
-
 @pytest.mark.parametrize("size", [BIG, WIDE])
 def test_collect_does_not_depend_on_threads(size):
     scene = random_scene(600, **size)
@@ -76,9 +73,6 @@ def test_texture_does_not_depend_on_threads(turned):
     assert_identical(results)
 
 
-# Blended errors
-
-
 @pytest.mark.parametrize("make", [random_scene, layered_scene])
 def test_blended_error_is_the_gradient_to_the_colours(make):
     """With K = 0 the image is sum w c, so d(sum error * image) / dc = sum w error, for any number of hits."""
@@ -101,9 +95,6 @@ def test_the_backward_pass_gives_the_blended_error_on_request():
     assert_close(request.sums_after_backward, passes.blended(errors), kind="value", name="sums")
     plain = Passes(scene).gradients()
     assert all(torch.equal(requested[name], plain[name]) for name in plain)
-
-
-# Training
 
 
 def test_training_does_not_depend_on_threads(tmp_path):

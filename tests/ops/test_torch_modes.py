@@ -50,9 +50,6 @@ def assert_equal(actual: dict[str, torch.Tensor], expected: dict[str, torch.Tens
     assert not different, different
 
 
-# Inference mode
-
-
 @pytest.mark.usefixtures("restore_launch_threads")
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_inference_mode_gives_the_bits_of_no_grad(threads, device):
@@ -83,9 +80,6 @@ def test_inference_mode_leaves_nothing_to_a_later_training(device):
     with torch.inference_mode():
         fresh.render(camera)
     assert_equal(gradients(fresh, camera), after)
-
-
-# Autocast
 
 
 @pytest.mark.parametrize("dtype", HALVES)

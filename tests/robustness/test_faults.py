@@ -90,9 +90,6 @@ def every_fault(run: Path, command: list[str], both: bool = False) -> list[Disk]
     return [Disk(run, place, number, number == FULL) for place in places for number in numbers[place]]
 
 
-# Training
-
-
 @pytest.mark.parametrize("both", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_training_survives_every_fault_of_its_disk(trained, scene, tmp_path, capsys, both):
     """What was saved stays, whatever fails; with --resume, on a disk that works again, the end is the same."""
@@ -133,9 +130,6 @@ def test_a_full_disk_still_gets_the_model_when_it_has_room_for_that(scene, tmp_p
         refused(capsys, command, *words)
     assert nw.load(run).meta["iteration"] == 2
     assert whole_checkpoints(run) == [1]
-
-
-# Other commands
 
 
 @pytest.mark.parametrize(

@@ -46,9 +46,6 @@ def chosen(count: int, device: torch.device) -> list[int]:
     return sorted({0, count - 1, *random.Random(0).sample(range(count), min(count, most))})
 
 
-# Memory, rendering
-
-
 def test_a_rendering_or_gradient_that_lacks_memory_can_be_repeated(device):
     scene = random_scene(40, device=device)
     model, camera = nw.Model(make_surfels(scene), make_texture(device=device)), make_camera(scene)
@@ -79,9 +76,6 @@ def test_a_rendering_or_gradient_that_lacks_memory_can_be_repeated(device):
     assert failed == len(all_fatal) if device.type == "cpu" else failed > 0.5 * len(all_fatal)
 
 
-# Memory, training
-
-
 def test_a_training_that_lacks_memory_goes_on_from_its_last_good_state(tiny_scene, device):
     """It ends with our error or, where CUDA graphs can be given up, goes on; the end has the bits of no fault."""
     config = small(deterministic=True)
@@ -106,9 +100,6 @@ def test_a_training_that_lacks_memory_goes_on_from_its_last_good_state(tiny_scen
             run.run(until=STEPS)
         assert_same_state(run, expected)
     assert failed > 5
-
-
-# Memory, for real
 
 
 @contextmanager

@@ -144,9 +144,6 @@ def test_what_is_not_finite_is_null(trainer, tmp_path):
     assert line["loss"] is None and line["psnr"] is None
 
 
-# TensorBoard
-
-
 def events(run: Path) -> dict[str, dict[int, float]]:
     """Scalars by tag and step, as TensorBoard shows them."""
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")

@@ -178,9 +178,6 @@ def test_damaged_lpips_weights_are_named(no_weights: Path) -> None:
         metrics.check_metrics(["lpips"], torch.device("cpu"))
 
 
-# Masks, and FLIP
-
-
 def test_a_mask_leaves_the_rest_out() -> None:
     image, target = images()
     mask = torch.zeros(48, 61, dtype=torch.bool)

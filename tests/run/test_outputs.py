@@ -67,9 +67,6 @@ def rendered(run: Path, camera: nw.Camera) -> torch.Tensor:
         return to_uint8(model.render(camera).image)
 
 
-# Still views
-
-
 @pytest.mark.parametrize(("views", "names"), [("test", TEST), ("train", TRAIN), ("all", TRAIN + TEST)])
 def test_still_views(run: Path, views: str, names: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert command("render", run, "--set", views) == 0
@@ -96,9 +93,6 @@ def test_info_tells_the_range_of_exposures(run: Path, capsys: pytest.CaptureFixt
     save_model(run, model)
     assert command("info", run) == 0
     assert "0.67 to 1.35 times the photos' mean" in capsys.readouterr().out
-
-
-# Paths
 
 
 def test_paths_are_those_of_the_runs_cameras(run: Path) -> None:
@@ -151,9 +145,6 @@ def test_a_path_from_a_file(run: Path, tmp_path: Path) -> None:
     assert difference.abs().max() <= 1 and len(files(run / "renders" / "path_transforms")) == 6
 
 
-# Videos
-
-
 def test_video(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     av = pytest.importorskip("av", reason="videos need PyAV (extra `video`)")
     video = tmp_path / "new" / "out.mp4"
@@ -165,9 +156,6 @@ def test_video(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         (stream,) = container.streams.video
         assert [(x.width, x.height) for x in container.decode(stream)] == [(128, 96)] * 6
         assert stream.average_rate == 12
-
-
-# Passes
 
 
 def test_buffers_of_views_or_else_of_frames(run: Path) -> None:
@@ -183,9 +171,6 @@ def test_buffers_of_views_or_else_of_frames(run: Path) -> None:
     assert command("render", run, "--frames", "1", "--buffers") == 0
     exr = {name for name in files(run / "renders") if name.endswith(".exr")}
     assert exr == {"test/a.exr", "test/sub/f.exr"} and (run / "renders" / "interpolate" / "0000.png").is_file()
-
-
-# Exports
 
 
 def test_export_ply(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -259,9 +244,6 @@ def test_exported_cameras_are_those_of_the_photos_files(tmp_path: Path, camera: 
     for one, other in zip(read.train, original.train, strict=True):
         torch.testing.assert_close(one.camera.viewmat, other.camera.viewmat, rtol=0, atol=1e-6)
         assert one.camera.K.allclose(other.camera.K) and one.image.equal(other.image)
-
-
-# Bad input
 
 
 @pytest.fixture

@@ -13,8 +13,6 @@ from nexwarp.train.trainer import Trainer
 from tests.model_file_support import refused
 from tests.trainer_support import small
 
-# Checkpoints
-
 
 def save_number(run: Path, number: int) -> None:
     save_checkpoint(run, {"x": torch.full((3,), float(number))}, {"iteration": number})

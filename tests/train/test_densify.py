@@ -98,9 +98,6 @@ def moments(parameter: nn.Parameter, optimizer: torch.optim.Optimizer) -> tuple[
     return next(((k, x.clone()) for k, x in state.items() if x.shape == parameter.shape), ("", None))
 
 
-# Split
-
-
 def test_children_tile_their_parent():
     """With hard edges, parent(x) = child(x) + child(x) everywhere in its plane: no gap, no overlap."""
     surfels, optimizer = make(12, seed=3)
@@ -155,9 +152,6 @@ def test_optimizer_follows_and_goes_on_stepping():
         assert optimizer.state[getattr(surfels, name)]["step"] == 2
 
 
-# Choice
-
-
 def test_choice_is_without_replacement_and_proportional_to_error():
     """P(i among the first two) = p_i + sum over j of p_j p_i / (1 - p_j); zero, negative and NaN errors never."""
     errors = torch.tensor([1.0, 2.0, 0.0, 4.0, 8.0, 0.5, float("nan"), 3.0, -1.0])
@@ -177,9 +171,6 @@ def test_choice_is_without_replacement_and_proportional_to_error():
     deviation = (counts - draws * expected)[live] / (draws * expected * (1 - expected))[live].sqrt()
     assert deviation.abs().max() < 4.0, f"{deviation.tolist()} standard deviations off"
     assert deviation.square().sum() < 20.0  # of 6 degrees of freedom: one in 400
-
-
-# Budget, prune, sums
 
 
 @pytest.mark.parametrize("budget", [20, 21, 50, 333])
@@ -334,9 +325,6 @@ def test_a_loop_of_ones_own_takes_along_what_belongs_to_surfels(kind, budget):
         (sum(p.sum() for p in surfels.parameters()) + extra.features.square().sum()).backward()
         optimizer.step()
     assert len(surfels) == min(budget, 54)
-
-
-# When
 
 
 def test_rounds_come_when_the_paper_says():

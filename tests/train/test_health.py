@@ -93,9 +93,6 @@ class Once(set[int]):
         return there
 
 
-# What is finite
-
-
 @pytest.mark.parametrize(("value", "place"), [(NAN, 0), (INF, 4999), (-INF, 9999)])
 def test_any_value_that_is_not_finite_is_found(device, value, place):
     tensors = {name: torch.randn(10_000, device=device) for name in ("a", "b", "c")}
@@ -103,9 +100,6 @@ def test_any_value_that_is_not_finite_is_found(device, value, place):
     assert not_finite(tensors) == []
     tensors["b"][place] = value
     assert not_finite(tensors) == ["b"]
-
-
-# Training
 
 
 @pytest.mark.parametrize(
@@ -190,9 +184,6 @@ def test_the_lowered_rate_is_kept_over_a_resume(scene, tmp_path):
     assert torch.equal(first.surfels.means, second.surfels.means)
 
 
-# The command line
-
-
 def test_the_command_line_gives_up_with_a_model(folder, tmp_path, monkeypatch, capsys):
     run = tmp_path / "run"
     inject(monkeypatch, {22}, poison("gradient surfels.means"))
@@ -205,9 +196,6 @@ def test_the_command_line_gives_up_with_a_model(folder, tmp_path, monkeypatch, c
     assert [line["iteration"] for line in lines] == list(range(1, len(lines) + 1))  # none of the other future
     assert nw.load(run).meta["iteration"] == 20
     assert json.loads((run / "checkpoint" / "state.json").read_text())["iteration"] == 20
-
-
-# Memory
 
 
 @pytest.mark.parametrize(

@@ -49,8 +49,6 @@ def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) ->
     assert trainer.render_options().background == (1.0, 1.0, 1.0)
 
 
-# Masks
-
 SQUARE = slice(10, 26), slice(14, 34)
 
 

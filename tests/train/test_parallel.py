@@ -164,9 +164,6 @@ def test_rates_follow_the_square_root_of_the_batch(scene: Scene) -> None:
         assert after["betas"] == pytest.approx((0.9**4, 0.999**4))
 
 
-# Bad input
-
-
 def test_ranks_that_do_not_fit_are_refused_alike(scene: Scene, tmp_path: Path) -> None:
     """All ranks raise the same error, whichever of them it is about."""
     few = dataclasses.replace(scene, train=scene.train[:1])

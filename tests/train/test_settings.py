@@ -45,9 +45,6 @@ def run(scene, tmp_path_factory) -> Path:
     return run
 
 
-# In Python
-
-
 def test_every_setting_can_be_set_to_what_it_is():
     """By its name, through JSON, for all presets: the same config, with the same types."""
     for config in PRESETS.values():
@@ -98,9 +95,6 @@ def test_refused(text, message):
     with pytest.raises(ValueError) as caught:
         with_settings(Config(), parse_settings([text]))
     assert str(caught.value).startswith(message) and len(str(caught.value)) < 200
-
-
-# Presets and older versions
 
 
 def test_paper_is_the_paper():
@@ -154,9 +148,6 @@ def test_settings_of_another_kind_are_refused(change):
     with pytest.raises(ValueError, match=r"^config: expected the settings of a nexwarp run") as caught:
         config_from_dict(change(Config().as_dict()))
     assert "\n" not in str(caught.value)
-
-
-# nexwarp train --set
 
 
 def test_a_run_keeps_what_was_set(run):

@@ -39,9 +39,6 @@ def test_a_trainer_is_freed_with_its_last_reference(scene):
         gc.enable()
 
 
-# Repeatability
-
-
 @pytest.mark.parametrize(("stop", "max_hits"), [(6, 2), (7, 2), (7, 0)])
 def test_resuming_changes_nothing(scene, tmp_path, stop, max_hits):
     straight = trained(scene, small(max_hits=max_hits))
@@ -77,9 +74,6 @@ def test_deterministic_runs_are_the_same_on_cuda(scene):
             assert torch.equal(model.state_dict()[name], value), name
 
 
-# Learning
-
-
 def test_it_learns(scene):
     # On black: on the photos' mean colour a run starts with less to learn.
     trainer = Trainer(scene, small(iterations=80, max_surfels=400, background=(0.0, 0.0, 0.0)), "cpu")
@@ -108,9 +102,6 @@ def test_progress_tells_what_happened(scene):
     assert all(later == before for i, (before, later) in enumerate(itertools.pairwise(counts)) if i % 3 != 1)
     assert counts[2] == 63 == int(1.05 * counts[0])
     assert max(counts) <= 120
-
-
-# Schedules
 
 
 def test_rates_are_log_linear_between_their_ends(scene):
@@ -169,9 +160,6 @@ def test_surfels_settle_with_two_hits(scene):
     for hits in (0, 1):
         few = Trainer(scene, small(iterations=12, max_hits=hits), "cpu")
         assert few.render_options().max_hits == hits
-
-
-# Scenes
 
 
 @pytest.mark.parametrize("factor", [64.0, 1 / 64])

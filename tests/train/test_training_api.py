@@ -45,9 +45,6 @@ def test_wrong_arguments_are_named(scene: Scene) -> None:
             nw.train(**({"scene": scene, "config": SMALL, "device": "cpu"} | wrong))
 
 
-# Callbacks
-
-
 def test_callbacks_see_each_step_and_stop_the_training(scene: Scene) -> None:
     class Enough(Exception):
         pass
@@ -61,9 +58,6 @@ def test_callbacks_see_each_step_and_stop_the_training(scene: Scene) -> None:
     with pytest.raises(Enough):
         nw.train(scene, SMALL, device="cpu", callbacks=[seen.append, stop])
     assert [step.iteration for step in seen] == [*range(1, 8)]
-
-
-# Losses
 
 
 def test_an_own_loss_is_added_and_reported(scene: Scene) -> None:
@@ -104,9 +98,6 @@ def test_losses_that_do_not_fit_are_named(
 ) -> None:
     with pytest.raises(error, match=match):
         run(scene, 1, losses=losses)
-
-
-# Optimizers
 
 
 def radam(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
@@ -169,9 +160,6 @@ def test_optimizers_that_do_not_fit_are_refused(
         nw.Trainer(scene, SMALL, "cpu", optimizer=make)
 
 
-# CUDA graphs
-
-
 def capturable(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
     on_gpu = [group | {"lr": torch.tensor(group["lr"], device="cuda")} for group in groups]
     return torch.optim.AdamW(on_gpu, capturable=True)
@@ -214,9 +202,6 @@ def test_a_loss_that_cannot_be_captured_warns_and_trains_on(scene: Scene) -> Non
     with pytest.warns(UserWarning, match="launched kernel by kernel, not as CUDA graphs: "):
         model = nw.train(scene, SMALL, device="cuda", losses={"own": loss})
     assert model.meta["iteration"] == SMALL.iterations
-
-
-# Scenes in memory
 
 
 def parts(scene: Scene) -> dict[str, Any]:

@@ -29,9 +29,6 @@ from tests.viewer.support import Client, ring, serving, wait_for
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
-# Pace
-
-
 def test_the_share_of_time_is_kept_whatever_pictures_cost():
     generator = np.random.default_rng(0)
     for share in (0.05, 0.2, 0.5):
@@ -56,9 +53,6 @@ def test_pictures_are_sized_to_come_in_time():
         assert scale == 1.0 or pace.seconds("a", 1280 * 800 * scale**2 * 2) > limit
     assert min(1280, 800) * pace.scale("a", 1280, 800, 1e-9) == pytest.approx(SMALLEST)
     assert pace.bands("a", 1e6) == 5 and pace.bands("b", 1e6) == 1
-
-
-# Cameras and paths
 
 
 def test_the_browsers_frame_there_and_back():
