@@ -200,10 +200,7 @@ def test_downscale_scales_pixels_and_keeps_areas(tmp_path, downscale):
         assert other.image.shape == (rows, columns, 3)
         assert (other.camera.width, other.camera.height) == (columns, rows)
         torch.testing.assert_close(
-            project(other.camera, full.points),
-            project(one.camera, full.points) / downscale,
-            rtol=0,
-            atol=1e-5,
+            project(other.camera, full.points), project(one.camera, full.points) / downscale, rtol=0, atol=1e-5
         )
         for row, column in ((0, 0), (rows - 1, columns - 1), (3, 4)):
             block = one.image[row * downscale : (row + 1) * downscale, column * downscale : (column + 1) * downscale]
@@ -266,10 +263,7 @@ BAD_SCENES = {
     "absolute name": (built(names=["C:\\x.png", "a.png"]), "image name .* leaves the images folder"),
     "name of bytes": (damaged(IMAGES, lambda data: data.replace(b"03.png", b"\xff3.png")), r"UTF-8, got b'\\xff3.png'"),
     "name of two lines": (built(names=["a\nb.png", "a.png"]), r"image name 'a\\nb.png' leaves the images folder"),
-    "absent photo": (
-        damaged("images/03.png", None),
-        "0: 1 of 10 photos: image not found: 03.png; --skip-missing",
-    ),
+    "absent photo": (damaged("images/03.png", None), "0: 1 of 10 photos: image not found: 03.png; --skip-missing"),
     "truncated photo": (damaged("images/03.png"), UNDECODABLE),
     "no photo at all": (damaged("images/03.png", lambda data: b"<html>not found</html>"), UNDECODABLE),
     "photos of another shape": (tall, "00.png: expected an image of 48x36 .* got 36x48"),

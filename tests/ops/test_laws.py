@@ -4,16 +4,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from tests.render_support import (
-    BACKGROUND,
-    BUFFERS,
-    MAX_HITS,
-    assert_alike,
-    assert_same,
-    draw,
-    reference_render,
-    twin,
-)
+from tests.render_support import BACKGROUND, BUFFERS, MAX_HITS, assert_alike, assert_same, draw, reference_render, twin
 from tests.scenes import (
     SURFEL_KEYS,
     Scene,

@@ -183,9 +183,6 @@ def test_results_repeat_whatever_the_threads(device: str) -> None:
 def test_a_target_that_wants_a_gradient_is_refused() -> None:
     given = inputs()
     target = given["target"].clone().requires_grad_()
-    for term in (
-        lambda: l1(given["image"], target),
-        lambda: texture_loss(given["textured"], given["weights"], target),
-    ):
+    for term in (lambda: l1(given["image"], target), lambda: texture_loss(given["textured"], given["weights"], target)):
         with pytest.raises(ValueError, match="target: expected a tensor that needs no gradient"):
             term()

@@ -144,11 +144,7 @@ def test_near_tests_the_depth_of_the_hit() -> None:
         means=tensor((4.0, 0.0, -1.0), (0.0, 0.0, 2.0)),
         quats=tensor((math.cos(math.pi / 8), 0.0, math.sin(math.pi / 8), 0.0), (1.0, 0.0, 0.0, 0.0)),
     )
-    for near, ids, depths in (
-        (0.01, [0, 1], [3.0, 2.0]),
-        (2.0, [0, -1], [3.0, 0.0]),
-        (3.001, [-1, -1], [0.0, 0.0]),
-    ):
+    for near, ids, depths in ((0.01, [0, 1], [3.0, 2.0]), (2.0, [0, -1], [3.0, 0.0]), (3.001, [-1, -1], [0.0, 0.0])):
         hits = collect(shape, colors, viewmat, VIEW._replace(near=near), 2)
         assert hits.ids[2, 2].tolist() == ids
         value_of(hits.depths[2, 2], depths, "depths")

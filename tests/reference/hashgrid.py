@@ -20,11 +20,7 @@ def hash_corners(corners: torch.Tensor, table_size: int) -> torch.Tensor:
 
 
 def encode(
-    positions: torch.Tensor,
-    depths: torch.Tensor,
-    grid: torch.Tensor,
-    resolutions: torch.Tensor,
-    focal: float,
+    positions: torch.Tensor, depths: torch.Tensor, grid: torch.Tensor, resolutions: torch.Tensor, focal: float
 ) -> torch.Tensor:
     """Features (n, L * F), level-major.
 

@@ -80,11 +80,7 @@ def test_initial_surfels(scene, budget, orient):
     config = small(max_surfels=budget, orient_points=orient, skybox=0)
     surfels = initial_surfels(scene, config, torch.Generator().manual_seed(0))
     points = initial_points(
-        scene.points,
-        scene.colors,
-        budget // 2,
-        track_lengths=scene.track_lengths,
-        errors=scene.reprojection_errors,
+        scene.points, scene.colors, budget // 2, track_lengths=scene.track_lengths, errors=scene.reprojection_errors
     )
     count = len(surfels)
     assert count == len(points.means) and count <= budget // 2
