@@ -72,11 +72,9 @@ def test_training_says_what_it_does(scene, tmp_path, capsys):
     assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, "--max-hits", "0", "--seed", "3"]) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    assert out.startswith("tiny on the CPU, preset default\n8 training")
-    assert f"next: nexwarp view {run} " in out.splitlines()[-1]
-    assert "8 training and 2 test views of 48x36" in out
-    for word in ("iteration 20/20", "it/s", "loss", "train", "dB", "surfels", "s left", "test PSNR", "test SSIM"):
+    for word in ("tiny on the CPU, preset default", "8 training and 2 test views of 48x36", "iteration 20/20"):
         assert word in out, word
+    assert f"next: nexwarp view {run} " in out.splitlines()[-1]
     settings = config_from_dict(read(run, "config.json")["config"])
     assert (settings.max_hits, settings.seed) == (0, 3)
     assert nw.load(run).options.max_hits == 0

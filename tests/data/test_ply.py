@@ -67,9 +67,6 @@ def test_binary_after_another_element(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "names", "values", "expected"),
     [
-        ("f4", "red green blue", (0.0, 0.5, 2.0), (0, 128, 255)),
-        ("u2", "diffuse_red diffuse_green diffuse_blue", (0, 32768, 65535), (0, 128, 255)),
-        ("u1", "r g b", (1, 2, 3), (1, 2, 3)),
         ("f4", "f_dc_0 f_dc_1 f_dc_2", (0.0, -0.5 / BAND_0, 0.5 / BAND_0), (128, 0, 255)),
         ("f4", "red green blue", (np.nan, np.inf, -np.inf), (128, 255, 0)),
         ("f4", "s t u", (1, 2, 3), (128, 128, 128)),

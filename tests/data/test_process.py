@@ -147,14 +147,6 @@ def test_bad_videos_are_one_line_and_leave_nothing(tmp_path: Path, capsys: pytes
     assert not scene.exists() and not scene.parent.exists()
 
 
-def test_a_missing_package_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "a.mp4").touch()
-    monkeypatch.setitem(__import__("sys").modules, "av", None)
-    refused(capsys, ["process", str(tmp_path / "a.mp4"), str(tmp_path / "scene")], "pip install 'nexwarp[video]'")
-
-
 def test_videos_are_known_by_their_suffix(tmp_path: Path) -> None:
     (tmp_path / "scene.mp4").mkdir()
     assert needs_cameras(SceneSource("a/walk.MOV"))

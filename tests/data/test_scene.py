@@ -18,7 +18,6 @@ from nexwarp.data.scene import SceneSource
 from nexwarp.errors import MissingError, SceneError
 
 WIDTH, HEIGHT = 48, 36
-REAL = Path(__file__).parents[3] / "shared" / "data"
 
 
 def pose(index: int) -> np.ndarray:
@@ -302,20 +301,3 @@ def test_bad_downscale(tmp_path):
         load_scene(path, downscale=2.0)  # type: ignore[arg-type]  # what is refused
     with pytest.raises(ValueError, match=r"downscale: expected at most the size of .*, 48x36, got 37"):
         load_scene(path, downscale=37)
-
-
-def test_real_scene():
-    if not (REAL / "fox").is_dir():
-        pytest.skip(f"the real scenes are not here: {REAL / 'fox'}")
-    scene = load_scene(REAL / "fox", downscale=2)
-    assert (len(scene.train), len(scene.test)) == (43, 7) and scene.points.shape == (10_844, 3)
-    shares = []
-    for view in views_of(scene):
-        camera = view.camera
-        assert (camera.width, camera.height) == (265, 473) and view.image.shape == (473, 265, 3)
-        depths = (scene.points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3])[:, 2]
-        pixels = project(camera, scene.points)
-        inside = (pixels >= 0).all(dim=1) & (pixels[:, 0] < 265) & (pixels[:, 1] < 473) & (depths > camera.near)
-        shares.append(inside.double().mean().item())
-    # The mean track has 6.9 of the 50 photos, and a point lies in at least those it was triangulated from.
-    assert min(shares) > 0.05 and np.mean(shares) > 6.9 / 50

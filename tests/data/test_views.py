@@ -41,14 +41,6 @@ def test_photo_mask_and_alpha_are_those_of_the_view() -> None:
         assert torch.equal(mask, view.mask) and torch.equal(alpha, view.alpha / 255.0)
 
 
-def test_what_comes_next_changes_nothing_on_a_cpu():
-    views = make_views(4)
-    mine = training_views.TrainingViews(views, torch.device("cpu"))
-    for index, ahead in ((2, [1, 0]), (1, []), (3, [3, 3]), (0, [1, 2, 3])):
-        _, photo = mine.get(index, ahead)
-        assert torch.equal(photo, views[index].image.float() / 255.0)
-
-
 @pytest.mark.cuda
 def test_photos_fetched_ahead_are_the_photos(monkeypatch: Any):
     """In any order, right guesses and wrong ones, while the GPU is busy; and no more than two wait."""

@@ -1,7 +1,6 @@
 """The log of a training: lines are what the steps were, cost nothing in between, and go on when a run is resumed."""
 
 import dataclasses
-import importlib.util
 import json
 import math
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 
-from nexwarp.cli import main as cli
 from nexwarp.data import Scene, load_scene
 from nexwarp.run.folder import LOG_FILE, TENSORBOARD_FOLDER
 from nexwarp.run.log import TrainingLog, keep_lines
@@ -180,13 +178,3 @@ def test_tensorboard_shows_the_lines(scene, tmp_path):
         assert shown[tag] == pytest.approx({step: value(line) for step, line in steps.items()}, rel=1e-6), tag
     terms = {name for line in written for name in line["losses"]}
     assert {f"loss/{name}" for name in terms | {"total"}} == {tag for tag in shown if tag.startswith("loss/")}
-
-
-def test_a_missing_package_is_one_line(tmp_path, capsys, monkeypatch):
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "tensorboard" else find(name, *a))
-    run = tmp_path / "runs" / "new"
-    assert cli.main(["train", "demo", "--run", str(run), "--device", "cpu", "--tensorboard"]) == 2
-    err = capsys.readouterr().err
-    assert "--tensorboard" in err and "pip install 'nexwarp[tensorboard]'" in err and err.count("\n") == 1
-    assert not run.parent.exists()

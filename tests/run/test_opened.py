@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from pathlib import Path
 
 import pytest
@@ -88,18 +87,6 @@ def test_the_ring_around_a_scene_sees_its_middle() -> None:
         inside, _ = camera.project(points)
         seen = (inside >= 0).all(-1) & (inside < torch.tensor([camera.width, camera.height])).all(-1)
         assert seen.float().mean() > 0.8
-
-
-@pytest.mark.parametrize(
-    ("metric", "remedy"), [("flip", "pip install 'nexwarp[flip]'"), ("lpips", "python -m benchmarks.lpips_weights")]
-)
-def test_a_metric_without_its_package_is_one_line(metric, remedy, model, tmp_path, monkeypatch, capsys):
-    model.save(tmp_path / "run")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    monkeypatch.setenv("NEXWARP_LPIPS", str(tmp_path / "vgg16.safetensors"))
-    monkeypatch.setitem(sys.modules, "lpips", None)
-    command = ["eval", str(tmp_path / "run"), "--scene", "nowhere", "--metrics", metric]
-    refused(capsys, command, f"--metrics: {metric}", remedy)
 
 
 def test_a_model_beside_a_run_of_its_name_leaves_the_run_alone(model: nw.Model, tmp_path: Path) -> None:

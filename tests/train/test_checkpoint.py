@@ -10,7 +10,6 @@ import torch
 from nexwarp.data import Scene
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, load_checkpoint, save_checkpoint
 from nexwarp.train.trainer import Trainer
-from tests.model_file_support import refused
 from tests.trainer_support import small
 
 
@@ -71,10 +70,6 @@ def test_every_flipped_bit_and_every_length_is_found(tmp_path, name):
             assert name == "state.json" and state == {"iteration": 2}, bad
     file.write_bytes(content + b"\0")
     assert load_checkpoint(tmp_path)[1] == {"iteration": 1}
-
-
-def test_no_checkpoint(tmp_path):
-    refused(FileNotFoundError, load_checkpoint, tmp_path, names=tmp_path, match="expected a checkpoint to resume from")
 
 
 def test_a_state_that_no_training_can_have_is_refused(tiny_scene: Scene, tmp_path: Path) -> None:

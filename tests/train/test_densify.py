@@ -136,22 +136,6 @@ def test_split_copies_everything_else_and_leaves_others_alone():
         assert not moments[chosen].any() and not moments[20:].any(), key
 
 
-def test_optimizer_follows_and_goes_on_stepping():
-    surfels, optimizer = make(30)
-    densifier = densifier_of(surfels, budget=31, prune_opacity=0.4, fraction=0.5)
-    densifier.accumulate(torch.arange(30.0))
-    more, pruned = counts(densifier.step(optimizer, generator()), 30)
-    assert more == 1 + pruned > 1 and len(surfels) == 31
-    for group in optimizer.param_groups:
-        assert len(group["params"]) == 1 and group["params"][0] is getattr(surfels, group["name"])
-    assert set(optimizer.state) == set(surfels.parameters())
-    before = rows_of(surfels)
-    step(surfels, optimizer)
-    for name, old in before.items():
-        assert bool((getattr(surfels, name) != old).all()), name
-        assert optimizer.state[getattr(surfels, name)]["step"] == 2
-
-
 def test_choice_is_without_replacement_and_proportional_to_error():
     """P(i among the first two) = p_i + sum over j of p_j p_i / (1 - p_j); zero, negative and NaN errors never."""
     errors = torch.tensor([1.0, 2.0, 0.0, 4.0, 8.0, 0.5, float("nan"), 3.0, -1.0])

@@ -66,29 +66,22 @@ def test_every_setting_can_be_set_to_what_it_is():
     [
         ("max_resolution=1", "max_resolution: expected a setting, such as texture.max_resolution"),
         ("texture.nope=1", "texture.nope: expected a setting, such as texture."),
-        ("texture=1", "texture: expected a setting"),
         ("texture.__init__=1", "texture.__init__: expected a setting"),
         ("texture.levels=16.0", "texture.levels: expected an integer, got 16.0"),
         ("texture.residual=1", "texture.residual: expected true or false, got 1"),
         ("texture.max_resolution=NaN", "texture.max_resolution: expected a number or null, got NaN"),
         (f"iterations=1{'0' * 4000}", "iterations: expected an integer, got 1000"),
-        ("mask_mode=3", "mask_mode: expected text, got 3"),
         ("mask_mode=both", "mask_mode: expected one of ignore, background, got 'both'"),
         ("rates.means=[1e-3]", "rates.means: expected a list of 2 numbers, got [0.001]"),
         ("rates.means=[0.1, 0]", "rates.means: expected rates > 0, or 0 throughout, got (0.1, 0.0)"),
         ("background=[0, 0, 2]", "background: expected at least 0 and at most 1, got 2"),
-        ("background=[[0], 0, 0]", "background: expected a number, got [0]"),
         ("densify.every=0", "densify.every: expected at least 1, got 0"),
-        ("losses.dssim=2", "losses.dssim: expected at least 0 and at most 1, got 2"),
         ("skybox", "expected KEY=VALUE, got 'skybox'"),
         ("max_surfels=15", "max_surfels: expected at least 16, got 15"),
-        ("iterations=0", "iterations: expected at least 1, got 0"),
         ("max_hits=9", "max_hits: expected at least 0 and at most 8, got 9"),
         ("texture.levels=0", "texture.levels: expected at least 1 and at most 64, got 0"),
         ("texture.table_size=1000", "texture.table_size: expected a power of two, got 1000"),
-        ("texture.sh_degree=4", "texture.sh_degree: expected at least 0 and at most 3, got 4"),
         ("coarse=0.4", "coarse: expected a setting, got one that was removed"),
-        ("=1", "expected KEY=VALUE, got '=1'"),
     ],
 )
 def test_refused(text, message):
@@ -114,11 +107,6 @@ def test_paper_is_the_paper():
     rounds = {"start": 500, "stop": 25_000, "every": 100, "fraction": 0.05}
     pruning = {"prune_opacity": 0.005, "prune_at_cap": False, "relocate": 0.0}
     assert dataclasses.asdict(p.densify) == rounds | pruning
-
-
-def test_unknown_preset_is_refused():
-    with pytest.raises(ValueError, match=r"^preset: expected one of default, paper, web, got 'papr'$"):
-        preset("papr")
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
