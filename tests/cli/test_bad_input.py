@@ -63,6 +63,7 @@ def test_no_cuda_when_asked_for(scene, finished, refuses, capsys):
     [
         ("tensorboard", ["--tensorboard", "pip install 'nexwarp[tensorboard]'"], ["train", "demo", "--tensorboard"]),
         ("av", ["pip install 'nexwarp[video]'"], ["process", "{file}.mp4", "{file}.scene"]),
+        ("av", ["--video", "pip install 'nexwarp[video]'"], ["render", "{run}", "--video", "{file}.out.mp4"]),
         ("flip_evaluator", ["--metrics: flip", "pip install 'nexwarp[flip]'"], ["eval", "{run}", "--metrics", "flip"]),
         ("lpips", ["--metrics: lpips", "python -m benchmarks.lpips_weights"], ["eval", "{run}", "--metrics", "lpips"]),
     ],

@@ -26,15 +26,6 @@ def few_steps(small_preset, monkeypatch):
     monkeypatch.setattr("nexwarp.export.fit.FEWEST_STEPS", 2)
 
 
-def test_a_finished_run_becomes_a_web_page(finished, capsys):
-    assert (
-        cli.main(["export", str(finished), "--format", "web", "--out", str(finished / "page"), "--device", "cpu"]) == 0
-    )
-    names = {file.name for file in (finished / "page").iterdir()}
-    assert {"index.html", "viewer.js", "scene.nxw", baked.BAKED_FILE, baked.ATLAS_FILE} <= names
-    assert "<title>tiny</title>" in (finished / "page" / "index.html").read_text()
-
-
 def test_notes_are_in_the_coordinates_of_exports(finished, tmp_path, monkeypatch, capsys):
     """Also where an edit moves and scales them; a headset then shows the scene at that scale."""
     notes = tmp_path / "notes.json"

@@ -63,8 +63,8 @@ def test_ctrl_c_while_libraries_load_prints_one_line() -> None:
     assert started.communicate()[1] == "nexwarp: interrupted\n" and started.returncode == 130
 
 
-HOSTILE = "\x1b[2J\x1b]0;owned\x07\x9b1m\r\n\u202egnp.exe\u2066"
-ESCAPED = r"\x1b[2J\x1b]0;owned\x07\x9b1m\r\n\u202egnp.exe\u2066"
+HOSTILE = "\x1b[2J\x1b]0;owned\x07\x9b1m\r\n\u202egnp.exe\u2066[b]"
+ESCAPED = r"\x1b[2J\x1b]0;owned\x07\x9b1m\r\n\u202egnp.exe\u2066[b]"
 
 
 def test_names_of_strangers_do_not_reach_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

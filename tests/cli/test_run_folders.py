@@ -157,16 +157,6 @@ def test_all_files_of_a_run_are_known(finished, scene, tmp_path):
     assert delete_files(finished) == [] and list(finished.iterdir()) == []
 
 
-def test_paths_may_have_brackets(scene, tmp_path, monkeypatch, capsys):
-    """They are no markup: what is printed is the path."""
-    monkeypatch.chdir(tmp_path)
-    run = "my [old] run [/b]"
-    train = ["train", str(scene), "--run", run, *FLAGS, "--iterations", "1"]
-    for arguments in (train, ["info", run], ["export", run], ["render", run]):
-        assert cli.main(arguments) == 0, arguments
-        assert run in capsys.readouterr().out, arguments
-
-
 def test_a_run_may_not_replace_its_own_scene(scene, tmp_path, capsys):
     folder = tmp_path / "holds"
     shutil.copytree(scene, folder / "scene")

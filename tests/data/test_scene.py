@@ -84,20 +84,6 @@ def views_of(scene):
     return sorted([*scene.train, *scene.test], key=lambda view: view.name)
 
 
-@pytest.mark.parametrize("where", ["sparse/0", "sparse", "."])
-def test_text_and_binary_load_identically(tmp_path, where):
-    binary = load_scene(make_scene(tmp_path / "binary", where=where))
-    text = load_scene(make_scene(tmp_path / "text", where=where, text=True))
-    assert torch.equal(binary.points, text.points) and torch.equal(binary.colors, text.colors)
-    assert torch.equal(binary.track_lengths, text.track_lengths)
-    assert torch.equal(binary.reprojection_errors, text.reprojection_errors)
-    assert binary.scale == pytest.approx(text.scale, rel=1e-12)
-    for one, other in zip(views_of(binary), views_of(text), strict=True):
-        assert one.name == other.name and torch.equal(one.image, other.image)
-        torch.testing.assert_close(one.camera.viewmat, other.camera.viewmat, rtol=0, atol=1e-7)
-        assert torch.equal(one.camera.K, other.camera.K)
-
-
 def test_loads_what_was_written(tmp_path):
     scene = load_scene(make_scene(tmp_path))
     assert scene.path == tmp_path and scene.points.dtype == torch.float32 and scene.colors.dtype == torch.uint8

@@ -1,6 +1,5 @@
 """Videos, judged by decoding them: frames, size, rate, colours."""
 
-import builtins
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import torch
 
 from nexwarp.errors import FormatError
 from nexwarp.io import video
-from nexwarp.io.video import check_video, frame_pixels, read_frames, video_writer
+from nexwarp.io.video import frame_pixels, read_frames, video_writer
 
 av = pytest.importorskip("av", reason="videos need PyAV (extra `video`)")
 
@@ -87,19 +86,6 @@ def test_wrong_inputs_are_named(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="file"), video_writer(tmp_path / "file" / "a.mp4", 32, 32):
         pass
     assert [f.name for f in tmp_path.iterdir()] == ["file"]
-
-
-def test_without_the_extra_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    original = builtins.__import__
-
-    def absent(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.split(".")[0] == "av":
-            raise ImportError("no av")
-        return original(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", absent)
-    with pytest.raises(ValueError, match=r"a\.mp4: videos need PyAV.*pip install 'nexwarp\[video\]'"):
-        check_video(tmp_path / "a.mp4", 30.0)
 
 
 PATCHES = np.array(

@@ -66,6 +66,7 @@ def test_file_holds_named_channels(tmp_path: Path) -> None:
     save_buffers(tmp_path / "a.exr", buffers)
     with OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True) as file:
         kinds = {p.name(): {c: x.pixels.dtype for c, x in p.channels.items()} for p in file.parts}
+        red = next(p for p in file.parts if p.name() == "image").channels["R"].pixels
         ids = next(p for p in file.parts if p.name() == "ids.1").channels["Y"].pixels
     three, one = dict.fromkeys("RGB", np.float32), {"Y": np.float32}
     assert kinds == {
@@ -75,7 +76,8 @@ def test_file_holds_named_channels(tmp_path: Path) -> None:
         "ids.0": {"Y": np.uint32},
         "ids.1": {"Y": np.uint32},
     }
-    assert ((ids == 2**32 - 1) == (buffers.ids[..., 1] == -1).numpy()).all()
+    assert (red == buffers.image[..., 0].detach().numpy()).all()
+    assert (ids.view("int32") == buffers.ids[..., 1].numpy()).all() and (ids == 2**32 - 1).any()
 
 
 def test_bad_files_are_refused(tmp_path: Path) -> None:

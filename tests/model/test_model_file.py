@@ -1,7 +1,6 @@
 """Model files: what comes back is what went in, damage is one clear line."""
 
 import pickle
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +9,10 @@ import safetensors.torch
 import torch
 
 import nexwarp as nw
-from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, save_model
-from nexwarp.model.options import RenderOptions
 from nexwarp.model.texture import NEVER, DetailLimits
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
-from tests.model_file_support import META, OPTIONS, make_model, refused, rewrite
-from tests.scenes import make_surfels, random_scene
+from tests.model_file_support import make_model, refused, rewrite
 
 
 class Bomb:
@@ -51,14 +47,6 @@ def test_detail_limits_come_back_exactly(tmp_path: Path, name: str) -> None:
     rewrite(file, lambda tensors, _: tensors.update({name: torch.rand(len(model.surfels) + 1)}))
     with pytest.raises(ValueError, match=rf"expected the tensors of a nexwarp model \({name}: expected shape"):
         nw.load(file)
-
-
-@pytest.mark.parametrize("changes", [{"exposure": "mean"}, {"detail_limits": False}, {"max_hits": 0}])
-def test_options_survive(tmp_path: Path, changes: dict[str, Any]) -> None:
-    model = Model(make_surfels(random_scene(3)), None, options=OPTIONS.changed(**changes), meta=META)
-    loaded = nw.load(save_model(tmp_path, model))
-    assert loaded.options == model.options
-    assert not {field.name for field in fields(RenderOptions)} & loaded.meta.keys()
 
 
 def test_missing_model(tmp_path):

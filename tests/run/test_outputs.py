@@ -173,14 +173,6 @@ def test_buffers_of_views_or_else_of_frames(run: Path) -> None:
     assert exr == {"test/a.exr", "test/sub/f.exr"} and (run / "renders" / "interpolate" / "0000.png").is_file()
 
 
-def test_export_ply(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command("export", run) == 0
-    assert files(run / "export") == {"surfels.ply", "splats.ply"}
-    assert capsys.readouterr().out.split() == [str(run / "export" / n) for n in ("surfels.ply", "splats.ply")]
-    assert command("export", run, "--format", "ply", "--out", tmp_path / "a" / "b") == 0
-    assert files(tmp_path / "a" / "b") == {"surfels.ply", "splats.ply"}
-
-
 def test_export_splits_what_is_large_from_the_cameras_of_the_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def exported(*options: str) -> bytes:
         assert command("export", run, *options) == 0

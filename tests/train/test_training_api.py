@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file
 
 import nexwarp as nw
-from nexwarp.cli import main as cli
 from nexwarp.data import Scene
 from nexwarp.errors import CheckpointError
 from nexwarp.train.optimizer import OptimizerMaker, ParameterGroup
@@ -27,15 +25,6 @@ def run(scene: Scene, until: int | None = None, **options: Any) -> nw.Trainer:
     trainer = nw.Trainer(scene, SMALL, "cpu", **options)
     trainer.run(until=until)
     return trainer
-
-
-def test_python_gives_the_bits_of_the_command_line(tiny_folder: Path, scene: Scene, tmp_path: Path) -> None:
-    assert cli.main(["train", str(tiny_folder), "--run", str(tmp_path / "run"), "--device", "cpu"]) == 0
-    model = nw.train(scene, SMALL, device="cpu")
-    ours, theirs = load_file(model.save(tmp_path / "ours")), load_file(tmp_path / "run" / "model.safetensors")
-    assert ours.keys() == theirs.keys()
-    assert all(torch.equal(ours[name], value) for name, value in theirs.items())
-    assert model.options == nw.load(tmp_path / "run").options
 
 
 def test_wrong_arguments_are_named(scene: Scene) -> None:

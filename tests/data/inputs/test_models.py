@@ -86,6 +86,9 @@ MODELS = {
     "names with backslashes": windows_names,
     "names in another Unicode form": other_unicode_form,
     "absolute names": absolute_names,
+    "text in sparse": lambda path: make_scene(path, where="sparse", text=True),
+    "text in the scene's folder": lambda path: make_scene(path, where=".", text=True),
+    "binary in the scene's folder": lambda path: make_scene(path, where="."),
 }  # fmt: skip
 
 
@@ -98,6 +101,7 @@ def test_a_model_in_other_words_is_the_same(tmp_path, kind):
         assert torch.equal(view.camera.K, expected.camera.K)
     assert torch.equal(scene.points, reference.points) and torch.equal(scene.colors, reference.colors)
     assert torch.equal(scene.track_lengths, reference.track_lengths)
+    assert torch.equal(scene.reprojection_errors, reference.reprojection_errors)
 
 
 @pytest.mark.parametrize(

@@ -298,22 +298,6 @@ def test_the_subject_fits_from_side_to_side(open_tab, site, size):
     assert not tab.errors
 
 
-def test_the_status_is_in_the_settings_and_notes_pass(open_tab):
-    tab = open_tab(390, 844)
-    tab.open("?renderer=baked")
-    status, note = tab.page.locator("#status"), tab.page.locator("#announce")
-    assert not status.is_visible()
-    tab.page.click("#more")
-    assert status.is_visible() and "40 surfels" in status.inner_text()
-    assert tab.page.locator("#head").inner_text() == "Two & <three>"
-    tab.page.click("#link")
-    tab.wait("!document.getElementById('announce').classList.contains('unseen')")
-    box = note.bounding_box()
-    assert "link" in note.inner_text() and box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["height"] > 20
-    tab.wait("document.getElementById('announce').classList.contains('unseen')", seconds=10.0)
-    assert not tab.errors
-
-
 def header_of(content: bytes) -> dict[str, Any]:
     header: dict[str, Any] = json.loads(content[16 : 16 + struct.unpack("<I", content[12:16])[0]])
     return header
