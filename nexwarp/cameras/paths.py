@@ -11,8 +11,6 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.errors import check_range
 
 DEGENERATE = 1e-6  # below this share of a comparable length, a length counts as zero
-ONE_WAY = 0.5  # smallest length of the mean viewing direction for a spiral
-SPREAD = 0.9  # share of the cameras that a spiral spans along each axis
 WINDOW = 2.0  # standard deviation, in cameras, of the window of `interpolate`
 COMMON = 0.9  # least share of the cameras that see the subject of an ellipse
 WIDEST_GAP = math.radians(120.0)  # between neighbours around that subject
@@ -61,37 +59,6 @@ def ellipse(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     angles = math.atan2(y, x) + torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
     offsets = torch.stack([torch.cos(angles), torch.sin(angles)], dim=1) * semi @ axes
     return [_looking(cameras[0], centre + offset, target, up) for offset in offsets]
-
-
-def spiral(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
-    """Return `count` cameras on a closed spiral among cameras that face one way.
-
-    In the frame of the mean camera, the path winds twice around the mean centre and moves forward and back once. Its
-    radius along each axis is the distance within which 90 % of the cameras lie. All its cameras look at
-    `focus(cameras)`, or along the mean viewing direction if the focus is not in front of all cameras, upright as
-    `up_direction`. All else is that of the first camera.
-
-    Raises:
-        ValueError: cameras that do not face one way or share one centre; `count` < 1.
-    """
-    check_range("count", count, 1)
-    viewmats, centres = camera_poses(cameras)
-    forward, up = viewmats[:, 2, :3].mean(0), up_direction(cameras)
-    if forward.norm() < ONE_WAY:
-        raise ValueError(
-            f"cameras: expected cameras that face one way, got a mean direction of length {forward.norm().item():.2f} "
-            f"(at least {ONE_WAY}); an ellipse suits cameras all around"
-        )
-    centre = centres.mean(0)
-    axes = look_at(centre, centre + forward, up)[:3, :3]
-    radii = torch.quantile(((centres - centre) @ axes.T).abs(), SPREAD, dim=0)
-    if radii.max() == 0.0:
-        raise ValueError(f"cameras: expected at least two distinct centres, got {len(cameras)} cameras at one place")
-    target, share = focus_ahead(cameras)
-    angles = torch.arange(count, dtype=torch.float64) * (2.0 * math.pi / count)
-    rounds = torch.stack([torch.cos(2 * angles), torch.sin(2 * angles), torch.sin(angles)], dim=1)
-    places = centre + rounds * radii @ axes
-    return [_looking(cameras[0], place, target if share == 1.0 else place + forward, up) for place in places]
 
 
 def through(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
@@ -312,4 +279,4 @@ def focus_ahead(cameras: Sequence[Camera]) -> tuple[torch.Tensor, float]:
     return target, ahead.double().mean().item()
 
 
-PATHS = {"ellipse": ellipse, "interpolate": interpolate, "spiral": spiral}
+PATHS = {"ellipse": ellipse, "interpolate": interpolate}

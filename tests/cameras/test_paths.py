@@ -17,7 +17,6 @@ from nexwarp.cameras.paths import (
     focus,
     interpolate,
     look_at,
-    spiral,
     subject,
     suited_path,
     through,
@@ -134,36 +133,7 @@ def row(count: int = 15, bend: float = 0.3) -> list[Camera]:
     return [camera(place, target + (1 - bend) * place) for place in places]
 
 
-def test_spiral_winds_within_the_cameras() -> None:
-    cameras = row(200)
-    path = spiral(cameras, 240)
-    given, mine = positions(cameras), positions(path)
-    offsets = mine - given.mean(0)
-    reach = torch.quantile((given - given.mean(0)).abs(), 0.9, dim=0)
-    assert torch.allclose(offsets.abs().amax(0), reach, rtol=0.1, atol=0.02)
-    # Twice around the viewing direction, evenly, always the same way, and closed.
-    scaled = offsets / reach
-    angles = torch.atan2(scaled[:, 2], scaled[:, 0])
-    steps = (angles.roll(-1) - angles + math.pi) % (2 * math.pi) - math.pi
-    assert abs(abs(steps.sum().item()) - 4 * math.pi) < 1e-6
-    assert (steps.abs() - 4 * math.pi / 240).abs().max() < 0.02
-    assert (mine - mine.roll(1, 0)).norm(dim=1).max() < 0.2
-
-
-def test_spiral_looks_at_the_focus_or_along_the_mean_direction() -> None:
-    cameras = row()
-    for each in spiral(cameras, 12):
-        assert_seen(each, focus(cameras))
-    for bend in (0.0, -0.5):  # parallel axes, axes that part
-        cameras = row(bend=bend)
-        forward = torch.stack([each.viewmat[2, :3] for each in cameras]).mean(0)
-        for each in spiral(cameras, 12):
-            assert_close(each.viewmat[2, :3], forward / forward.norm(), kind="value", name="forward")
-
-
-PATHS = pytest.mark.parametrize(
-    ("make", "cameras_of"), [(ellipse, ring), (spiral, row), (interpolate, row), (through, row)]
-)
+PATHS = pytest.mark.parametrize(("make", "cameras_of"), [(ellipse, ring), (interpolate, row), (through, row)])
 
 
 @PATHS
@@ -264,20 +234,15 @@ PARALLEL = "cameras: expected two or more with axes that are not parallel"
 @pytest.mark.parametrize(
     ("make", "given", "message"),
     [
-        *((make, [[]], "cameras: expected at least one, got none") for make in (ellipse, spiral, interpolate, through)),
-        *(
-            (make, [[ONE, ASIDE], 0], "count: expected at least 1, got 0")
-            for make in (ellipse, spiral, interpolate, through)
-        ),
+        *((make, [[]], "cameras: expected at least one, got none") for make in (ellipse, interpolate, through)),
+        *((make, [[ONE, ASIDE], 0], "count: expected at least 1, got 0") for make in (ellipse, interpolate, through)),
         *((ellipse, [each], PARALLEL) for each in ([ONE], [ONE, ONE])),
         (ellipse, [[ONE, ASIDE]], "cameras: expected at least two distinct centres"),
-        *((spiral, [each], "cameras: expected at least two distinct centres") for each in ([ONE], 3 * [ONE])),
         *(
             (make, [each], f"cameras: expected at least two distinct ones, got {len(each)}")
             for make in (interpolate, through)
             for each in ([ONE], 3 * [ONE])
         ),
-        (spiral, [[ONE, camera(torch.ones(3), torch.zeros(3)), ASIDE]], r"that face one way, .* an ellipse suits"),
         (look_at, [UP, 3 * UP, UP], "up: expected a direction across the line"),
     ],
 )
