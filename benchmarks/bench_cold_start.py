@@ -1,14 +1,10 @@
-"""Cold start: a fresh process with empty kernel caches, as after an install.
-
-Also times `nexwarp warmup`, which compiles ahead of time; its budget on CUDA is 60 s.
-"""
+"""Cold start: a fresh process with empty kernel caches, as after an install."""
 
 import json
 import os
 import subprocess
 import sys
 import tempfile
-import time
 
 from benchmarks.suite import Options
 from benchmarks.timing import ROOT, Measurement, figure
@@ -44,37 +40,24 @@ print(json.dumps(seconds))
 
 
 def run(options: Options) -> list[Measurement]:
-    """Time a process with empty and with filled caches, `nexwarp warmup` with both, and a process after it."""
+    """Time a process with empty and with filled caches."""
     with tempfile.TemporaryDirectory() as cache:
-        results = [m for state in ("empty", "filled") for m in parts(state, cache, options)]
-    with tempfile.TemporaryDirectory() as cache:
-        return [
-            *results,
-            *(warm_up(state, cache, options) for state in ("empty", "filled")),
-            *parts("warmed-up", cache, options),
-        ]
+        return [m for state in ("empty", "filled") for m in parts(state, cache, options)]
 
 
 def parts(state: str, cache: str, options: Options) -> list[Measurement]:
     """Return the seconds of each part of PROGRAM with kernel caches in a folder."""
-    line, _ = fresh_process([sys.executable, "-c", PROGRAM, options.device.type], cache)
+    line = fresh_process([sys.executable, "-c", PROGRAM, options.device.type], cache)
     return [
         figure(f"{name}, {state} cache", value, options.device, unit="s", scene="fresh process")
         for name, value in json.loads(line).items()
     ]
 
 
-def warm_up(state: str, cache: str, options: Options) -> Measurement:
-    """Return the seconds of the whole command with its imports; the note is its own last line, without imports."""
-    line, seconds = fresh_process([sys.executable, "-m", "nexwarp", "warmup", "--device", options.device.type], cache)
-    return figure(f"nexwarp warmup, {state} cache", seconds, options.device, unit="s", scene="fresh process", note=line)
-
-
-def fresh_process(command: list[str], cache: str) -> tuple[str, float]:
-    """Run a command with kernel caches in a folder; return the last line that it prints, and its seconds."""
+def fresh_process(command: list[str], cache: str) -> str:
+    """Run a command with kernel caches in a folder; return the last line that it prints."""
     environment = os.environ | {"WARP_CACHE_PATH": f"{cache}/warp", "CUDA_CACHE_PATH": f"{cache}/cuda"}
-    start = time.perf_counter()
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"the fresh process failed:\n{done.stderr}")
-    return done.stdout.splitlines()[-1], time.perf_counter() - start
+    return done.stdout.splitlines()[-1]

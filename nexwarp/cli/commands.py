@@ -1,9 +1,8 @@
-"""`nexwarp process`, `eval`, `render`, `edit`, `export`, `view`, `info` and `warmup`."""
+"""`nexwarp process`, `eval`, `render`, `edit`, `export`, `view` and `info`."""
 
 import dataclasses
 import math
 import shlex
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import tyro
 from rich.console import Console
 
 from nexwarp.cli import display
-from nexwarp.cli.options import Device_, Host_, Port_, Preset_, Run_, check_max_hits, pick_device
+from nexwarp.cli.options import Device_, Host_, Port_, Run_, pick_device
 from nexwarp.data import View
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import DEMO, SceneSource, scene_kinds
@@ -28,7 +27,6 @@ from nexwarp.io.json_files import READ_ERRORS, Json, read_object, write_json
 from nexwarp.model.edit import write_edits
 from nexwarp.model.model import Model
 from nexwarp.model.texture import NeuralTexture
-from nexwarp.run import warmup
 from nexwarp.run.edit import EditOrder, added, crop_command, described
 from nexwarp.run.evaluate import check_metrics, evaluate
 from nexwarp.run.export import RENDERED, ExportOrder, export_run
@@ -44,7 +42,7 @@ from nexwarp.run.folder import (
     read_metrics,
 )
 from nexwarp.run.render import RenderOrder
-from nexwarp.train.recipe import MASK_MODES, preset
+from nexwarp.train.recipe import MASK_MODES
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
@@ -364,36 +362,6 @@ def _describe_model(opened: OpenedModel) -> dict[str, str]:
         **({"edits": ", ".join(map(str, opened.edits))} if opened.edits else {}),
         "model file": f"{opened.file.stat().st_size / 1e6:.1f} MB",
     }
-
-
-@dataclass
-class Warmup:
-    """Compile the kernels of train, eval and render ahead of time, into Warp's kernel cache."""
-
-    preset: Preset_ = "default"
-    """The --preset of the training to come."""
-    max_hits: Annotated[int | None, option("K", "2")] = None
-    """The --max-hits of the training to come."""
-    device: Device_ = None
-    """Device to compile for."""
-
-    def __call__(self, console: Console) -> None:
-        """Compile."""
-        start = time.perf_counter()
-        check_max_hits(self.max_hits)
-        device = pick_device(self.device)
-        config = preset(self.preset)
-        if self.max_hits is not None:
-            config = dataclasses.replace(config, max_hits=self.max_hits)
-        before = warmup.cached_binaries()
-        with display.counting(console, "compiling", warmup.ITERATIONS) as done:
-            warmup.rehearse(config, device, done)
-        compiled = len(warmup.cached_binaries() - before)
-        console.print(
-            f"kernels ready on {display.device_name(device)}, preset {config.preset}: {compiled} compiled, "
-            f"{time.perf_counter() - start:.1f} s",
-            soft_wrap=True,
-        )
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Command line: `nexwarp train`, `eval`, `render`, `edit`, `export`, `view`, `info`, `process`, `sfm`, `warmup`."""
+"""Command line: `nexwarp train`, `eval`, `render`, `edit`, `export`, `view`, `info`, `process`, `sfm`."""
 
 import io
 import os
@@ -15,7 +15,7 @@ import tyro
 from rich.console import Console
 
 from nexwarp.cli import __version__, display
-from nexwarp.cli.commands import Edit, Eval, Export, Info, Process, Render, ViewCommand, Warmup
+from nexwarp.cli.commands import Edit, Eval, Export, Info, Process, Render, ViewCommand
 from nexwarp.cli.signals import stopped_by_signals
 from nexwarp.cli.train import Train
 from nexwarp.errors import NexwarpError, RankError
@@ -35,7 +35,6 @@ COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
     "info": Info,
     "process": Process,
     "sfm": Process,
-    "warmup": Warmup,
 }
 
 

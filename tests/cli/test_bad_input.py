@@ -101,7 +101,7 @@ def test_damaged_files_of_a_run(finished, capsys):
     ("arguments", "words"),
     [
         ([], ["expected one of {train, eval", "see nexwarp --help"]),
-        (["fly"], ["no command 'fly', expected one of train, eval", "warmup\n"]),
+        (["fly"], ["no command 'fly', expected one of train, eval", "sfm\n"]),
         (["trian", "x"], ["no command 'trian', expected one of", "; perhaps you meant nexwarp train\n"]),
         (["train"], ["missing from nexwarp train: scene folder of a colmap", "see nexwarp train --help"]),
         (["train", "x", "--iterations", "many"], ["--iterations: expected an integer, got 'many'; see nexwarp train"]),

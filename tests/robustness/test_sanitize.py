@@ -21,9 +21,9 @@ import torch
 import warp as wp
 
 import nexwarp as nw
-from nexwarp.run import warmup
 from nexwarp.train.recipe import preset
 from nexwarp.train.trainer import Trainer
+from tests.rehearsal import tiny_scene
 from tests.render_support import loss
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 
@@ -75,7 +75,7 @@ def separate_allocations(device: torch.device) -> Iterator[None]:
 
 def test_steps_and_frames_run(device: torch.device) -> None:
     """As by default and with fixed-order sums."""
-    scene = warmup.tiny_scene()
+    scene = tiny_scene()
     base = preset("default")
     config = dataclasses.replace(
         base,

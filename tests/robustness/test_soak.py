@@ -9,9 +9,9 @@ import warp as wp
 
 import nexwarp as nw
 from nexwarp.model.buffers import render_buffers
-from nexwarp.run.warmup import tiny_scene
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
+from tests.rehearsal import tiny_scene
 
 TIMES = int(os.environ.get("NEXWARP_SOAK", "1"))
 STEPS, FRAMES = 240 * TIMES, 240 * TIMES

@@ -1,15 +1,11 @@
-"""Compilation ahead of time: training, evaluating and rendering a tiny scene fills Warp's kernel cache."""
+"""Training, evaluating and rendering a tiny scene, which launches the kernels of a run."""
 
 import dataclasses
-from collections.abc import Callable
-from pathlib import Path
 
 import torch
-import warp as wp
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
-from nexwarp.ops import start_warp
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
 from nexwarp.train.trainer import Trainer
@@ -18,15 +14,15 @@ WIDTH, HEIGHT, POINTS = 64, 48, 100
 ITERATIONS = 8
 
 
-def rehearse(config: Config, device: torch.device, done: Callable[[], None] = lambda: None) -> None:
+def rehearse(config: Config, device: torch.device) -> None:
     """Train for a few steps, evaluate and render on a tiny scene with these settings; seed the generators like a run.
 
     The steps cover every SH degree, rounds of density control and steps after the last round, in the order of a full
-    run. The choice of surfels to relocate runs too. `done` is called after each of the `ITERATIONS` steps.
+    run. The choice of surfels to relocate runs too.
     """
     scene = tiny_scene()
     trainer = Trainer(scene, tiny(config), device)
-    trainer.run(lambda _: done())
+    trainer.run()
     if config.densify.relocate:
         trainer.densifier.unneeded(trainer.model(), trainer.views.cameras)
     model = trainer.finish()
@@ -60,11 +56,3 @@ def tiny_scene() -> Scene:
     colors = torch.randint(0, 256, (POINTS, 3), generator=generator, dtype=torch.uint8)
     scene = Scene.from_tensors([photo], [Camera(viewmat, K, WIDTH, HEIGHT)], points, colors, test_every=0)
     return dataclasses.replace(scene, test=scene.train)
-
-
-def cached_binaries() -> set[Path]:
-    """Return the compiled kernels in Warp's cache."""
-    start_warp()  # sets the folder of the cache
-    return {
-        path for path in Path(str(wp.config.kernel_cache_dir)).glob("*/*") if path.suffix in (".o", ".cubin", ".ptx")
-    }
