@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 from torch.nn.functional import conv2d, max_pool2d, normalize
 
 from nexwarp.data import View
-from nexwarp.errors import FormatError, SettingError
+from nexwarp.errors import FormatError, MissingError, SettingError
 from nexwarp.io.files import check_tensors_header, one_line
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
 from nexwarp.model.model import Model
@@ -157,8 +157,7 @@ def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
 def lpips_vgg(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float | None:
     """LPIPS (VGG, v0.1) of two images as of `ssim`, at least 16 pixels a side; None, with one warning, without weights.
 
-    The weights come from $NEXWARP_LPIPS, the cache folder or the package `lpips` (docs/quality.md). It is computed on
-    the GPU where there is one.
+    The weights come from `weights_file` (docs/quality.md). It is computed on the GPU where there is one.
     """
     x, y = _unit_images(image, target, mask)
     device = torch.device("cuda") if torch.cuda.is_available() else x.device
@@ -199,33 +198,16 @@ def check_metrics(metrics: Sequence[str], device: torch.device) -> None:
         )
     if "lpips" in metrics:
         try:
-            _load_lpips(device)
-        except (ImportError, OSError, RuntimeError, ValueError) as error:
+            load_vgg(weights_file(), device)
+        except (OSError, RuntimeError, ValueError) as error:
             raise SettingError(f"--metrics: lpips cannot be computed: {one_line(error)}") from None
 
 
-def _load_lpips(device: torch.device) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
-    """Return LPIPS as a function of two (H, W, 3) images in [0, 1]."""
-    if (file := weights_file()).is_file():
-        return load_vgg(file, device)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torchvision deprecates the arguments that lpips passes
-            import lpips
-
-            network = lpips.LPIPS(net="vgg", version="0.1", verbose=False).eval().to(device)
-    except (ImportError, OSError, RuntimeError) as error:  # no package, no download, another torch's torchvision
-        raise ImportError(
-            f"{one_line(error)}, and {file} does not exist: `python -m benchmarks.lpips_weights` in a clone writes it"
-        ) from None
-    return lambda x, y: network(x.permute(2, 0, 1)[None], y.permute(2, 0, 1)[None], normalize=False)
-
-
 @lru_cache(maxsize=2)
-def _lpips_distance(device: torch.device) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor] | None:
+def _lpips_distance(device: torch.device) -> "VGG | None":
     try:
-        return _load_lpips(device)
-    except (ImportError, OSError, RuntimeError, ValueError) as error:
+        return load_vgg(weights_file(), device)
+    except (OSError, RuntimeError, ValueError) as error:
         warnings.warn(f"LPIPS is left out: {one_line(error)}", RuntimeWarning, stacklevel=3)
         return None
 
@@ -290,6 +272,8 @@ class VGG(torch.nn.Module):
 
 def load_vgg(file: Path, device: torch.device | str = "cpu") -> VGG:
     """Read the network, for pictures on a device, from a file of `python -m benchmarks.lpips_weights`."""
+    if not file.is_file():
+        raise MissingError(f"{file}: expected a file, which `python -m benchmarks.lpips_weights` in a clone writes")
     try:
         check_tensors_header(file)
         weights = load_file(file)

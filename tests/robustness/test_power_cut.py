@@ -46,7 +46,7 @@ from nexwarp.run.folder import (
     read_run,
     remove_leftovers,
 )
-from nexwarp.run.log import _open_log, keep_lines
+from nexwarp.run.log import keep_lines
 from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
 from nexwarp.train.recipe import Config
@@ -251,7 +251,7 @@ def live(root: Path, number: int, allow: Callable[..., None], chance: random.Ran
             allow({number}, {None}, {None})
         first = int(last or 0)
         keep_lines(run / LOG_FILE, first)
-        with _open_log(run / LOG_FILE) as log:
+        with (run / LOG_FILE).open("a", encoding="utf-8") as log:
             for iteration in range(first + 1, first + chance.randint(2, 5)):
                 log.write(json.dumps({"iteration": iteration}) + "\n")
                 log.flush()
