@@ -1,6 +1,5 @@
 """Display of progress and results: live lines in a terminal, occasional lines in a log file."""
 
-import math
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -27,43 +26,14 @@ from nexwarp.train.report import StepReport
 REFRESH_SECONDS = 0.5
 LOG_LINES = 20
 LOG_SECONDS = 20.0  # between the lines of a stage
-RECENT = 30.0  # seconds after which a speed counts a third in the estimate of the time left
 
 
-class TimeLeft:
-    """How long a run takes on: the work that is left, counted in training steps, over its recent speed; and an end.
-
-    Attributes:
-        work: that is left, of all trainings of the run.
-        end: seconds that follow all of it.
-    """
-
-    def __init__(self, work: float = 0.0, end: float = 0.0, clock: Callable[[], float] = time.perf_counter) -> None:
-        self.work, self.end, self.clock = work, end, clock
-        self.last = clock()
-        self.recent_work = self.recent_seconds = 0.0
-
-    def spend(self, work: float) -> None:
-        """Note what was done since the last call; negative where a training went back."""
-        now = self.clock()
-        passed = now - self.last
-        kept = math.exp(-passed / RECENT)
-        self.recent_work = max(kept * self.recent_work + work, 0.0)
-        self.recent_seconds = kept * self.recent_seconds + passed
-        self.last, self.work = now, max(self.work - work, 0.0)
-
-    def seconds(self) -> float:
-        """Return the estimate, which needs some work done, or none left."""
-        if not self.work:
-            return self.end
-        return self.end + self.work * self.recent_seconds / max(self.recent_work, 1e-9)
-
-    def __str__(self) -> str:
-        seconds = self.seconds()
-        if seconds < 100:
-            return f"{seconds:.0f} s left in all"
-        minutes = round(seconds / 60)
-        return f"{minutes} min left in all" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min left in all"
+def time_left(seconds: float) -> str:
+    """Return an estimate of the time that a whole run takes on, as a person says it."""
+    if seconds < 100:
+        return f"{seconds:.0f} s left in all"
+    minutes = round(seconds / 60)
+    return f"{minutes} min left in all" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min left in all"
 
 
 def device_name(device: torch.device) -> str:
@@ -90,22 +60,21 @@ def plain_warnings(console: Console) -> Iterator[None]:
 
 @contextmanager
 def training(
-    console: Console, total: int, done: int, device: torch.device, name: str, left: TimeLeft
+    console: Console, total: int, done: int, device: torch.device, name: str, after: float = 0.0
 ) -> Iterator[Callable[[StepReport], None]]:
     """Show iteration, it/s, loss, training PSNR, surfels and memory of `total` iterations, and the whole run's time.
 
-    `done` of them were done before. Yield a function to call after each step: its numbers are fetched from the device
-    only when they are shown.
+    `done` of them were done before; the run's work `after` them costs as much as so many iterations. Yield a function
+    to call after each step: its numbers are fetched from the device only when they are shown.
     """
     start = shown = time.perf_counter()
     text = TextColumn("{task.fields[text]}")
     columns = (TextColumn(name), BarColumn(), MofNCompleteColumn(), text, TimeElapsedColumn())
-    noted = done
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task(name, total=total, completed=done, text="")
 
         def show(step: StepReport) -> None:
-            nonlocal shown, noted
+            nonlocal shown
             now = time.perf_counter()
             if console.is_terminal:
                 due = now - shown >= REFRESH_SECONDS
@@ -118,11 +87,10 @@ def training(
             text = f"{rate:.1f} it/s  loss {step.loss():.4f}  train {step.psnr():.2f} dB  {step.surfels:,} surfels"
             if (used := peak_memory(device)) is not None:
                 text += f"  {used / 2**30:.1f} GiB{' GPU' if device.type == 'cuda' else ''}"
-            left.spend(step.iteration - noted)
-            noted = step.iteration
-            progress.update(task, completed=step.iteration, text=f"{text}  {left}")
+            text += f"  {time_left((total - step.iteration + after) / rate)}"
+            progress.update(task, completed=step.iteration, text=text)
             if not console.is_terminal:
-                console.print(f"iteration {step.iteration:,}/{total:,}  {text}  {left}", soft_wrap=True)
+                console.print(f"iteration {step.iteration:,}/{total:,}  {text}", soft_wrap=True)
 
         yield show
 
@@ -150,7 +118,7 @@ def loading(console: Console) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextmanager
-def stages(console: Console, left: TimeLeft | None = None) -> Iterator[Callable[[str, int, int], None]]:
+def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
     """Show a bar, or lines in a log file, for each stage; yield a function of its name, items done and total."""
     tasks: dict[str, TaskID] = {}
     shown = time.perf_counter()
@@ -164,8 +132,7 @@ def stages(console: Console, left: TimeLeft | None = None) -> Iterator[Callable[
             if not console.is_terminal and (first or due):
                 console.print(f"{stage}: {total:,}" if first else f"{stage}: {done:,}/{total:,}", soft_wrap=True)
                 shown = time.perf_counter()
-            note = "" if left is None else f"  {left}"
-            progress.update(tasks[stage], completed=done, description=f"{stage}{note}")
+            progress.update(tasks[stage], completed=done)
 
         yield observe
 

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +16,7 @@ from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.cli import display
 from nexwarp.cli.commands import evaluate_run, figures
 from nexwarp.cli.signals import Stopped, stopped_by_signals
+from nexwarp.data import Scene
 from nexwarp.errors import DivergedError, OutOfMemoryError, RunError, StorageError
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.machine import needed_memory
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
 
 CHECKPOINTS_A_RUN = 10
-JUDGED = 1e-6  # seconds a pixel that metrics and pictures of a test view take beside its rendering, on two cores
 
 
 @dataclass
@@ -71,7 +71,6 @@ class Session(StageStore):
     every: int | None = None  # iterations between checkpoints; None saves ten a stage
     viewer: "Viewer | None" = None
     seconds: float = 0.0  # that complete teachers took
-    left: display.TimeLeft = field(default_factory=display.TimeLeft)  # of all stages and the evaluation
     begun: bool = False
 
     def complete(self, stage: Stage) -> Model | None:
@@ -101,12 +100,6 @@ class Session(StageStore):
             self.console.print(f"resumed at iteration {trainer.iteration:,}")
         elif self.resume and not self.begun:
             self.console.print(f"{folder}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
-        if not self.begun:
-            photos, tests = len(trainer.scene.train), trainer.scene.test
-            coming = [s for s in divide(self.record.config, self.record.own) if s.before >= stage.before]
-            pixels = sum(view.camera.width * view.camera.height for view in tests)
-            work = sum(s.work(photos) for s in coming) + VIEW_COST * (photos + len(tests))
-            self.left = display.TimeLeft(work - trainer.iteration, JUDGED * pixels)
         self.begun = True
 
     def train(self, stage: Stage, trainer: Trainer) -> None:
@@ -119,7 +112,8 @@ class Session(StageStore):
             create_run(folder, RunRecord(self.record.source, stage.config, self.ranks.device.type))
         total = stage.config.iterations
         every = self.every or max(total // CHECKPOINTS_A_RUN, 1)
-        bar = display.training(self.console, total, trainer.iteration, trainer.device, stage.name, self.left)
+        after = self.work_after(stage, trainer.scene)
+        bar = display.training(self.console, total, trainer.iteration, trainer.device, stage.name, after)
         log = TrainingLog(folder, trainer, tensorboard=self.tensorboard and not stage.teacher)
         with ExitStack() as stack:
             if self.ranks.first:
@@ -154,6 +148,13 @@ class Session(StageStore):
                 trainer.run(observe, warn)
             except DivergedError as error:
                 raise self._diverged(folder, trainer, error) from None
+
+    def work_after(self, stage: Stage, scene: Scene) -> float:
+        """Return what follows the steps of a stage, in training steps: its finish, later stages, and the evaluation."""
+        photos, tests = len(scene.train), len(scene.test)
+        coming = [later for later in divide(self.record.config, self.record.own) if later.before >= stage.before]
+        evaluation = VIEW_COST * (photos + tests)
+        return sum(each.work(photos) for each in coming) - stage.config.iterations + evaluation
 
     def finish(self, stage: Stage, trainer: Trainer) -> Model:
         """Finish, write and return the model of a trained stage; that of the run is also evaluated."""
@@ -205,12 +206,7 @@ class Session(StageStore):
     def _write(self, stage: Stage, trainer: Trainer) -> Model:
         """Finish and write the model of a stage, its cameras and figures; a student's have the time of its teachers."""
         folder = self._folder(stage)
-        with display.stages(self.console, self.left) as show:
-
-            def observe(name: str, done: int, total: int) -> None:
-                self.left.spend(VIEW_COST)
-                show(name, done, total)
-
+        with display.stages(self.console) as observe:
             finished = trainer.finish(observe)
         file = save_model(folder, finished)
         model = shared_model(file, self.ranks)

@@ -14,7 +14,7 @@ from rich.console import Console
 import nexwarp as nw
 from nexwarp import Config, Model, Scene, Trainer
 from nexwarp.cli import main as cli
-from nexwarp.cli.display import TimeLeft
+from nexwarp.cli.display import time_left
 from nexwarp.cli.session import Session
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import SettingError
@@ -358,30 +358,15 @@ def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
 
 
 def test_the_time_left_is_that_of_all_stages(tiny_scene: Scene, tmp_path: Path) -> None:
-    """Before the first step, all steps and renderings are left; before the evaluation, only those that it renders."""
-    run, photos, tests = tmp_path / "run", len(tiny_scene.train), len(tiny_scene.test)
+    """Before the first step, all steps and renderings are left; after the last one, those that finish and evaluate."""
+    photos, tests = len(tiny_scene.train), len(tiny_scene.test)
     record = RunRecord(SceneSource(str(tiny_scene.path)), CONFIG, own=OwnTeachers(2, 4, 240))
-    session = Session(run, record, Console(quiet=True), Ranks.alone(CPU))
-    runner = StageRunner(tiny_scene, CONFIG, CPU, session, own=record.own)
+    session = Session(tmp_path, record, Console(quiet=True), Ranks.alone(CPU))
     passes = (CONFIG.smooth_sh > 0) + CONFIG.footprints
-    assert session.left.work == CONFIG.iterations + VIEW_COST * (3 * passes * photos + photos + tests)
-    create_run(run, record)
-    runner.train()
-    runner.finish()
-    assert session.left.work == pytest.approx(VIEW_COST * (photos + tests))
-
-
-def test_the_time_left_follows_the_recent_speed() -> None:
-    now = 0.0
-    left = TimeLeft(1000.0, 7.0, clock=lambda: now)
-    for _ in range(100):
-        now += 2.0
-        left.spend(1.0)
-    assert left.seconds() == pytest.approx(900 * 2 + 7) and str(left) == "30 min left in all"
-    for _ in range(300):
-        now += 0.5
-        left.spend(1.0)
-    assert left.seconds() == pytest.approx(600 * 0.5 + 7, rel=0.05)
-    left.spend(600.0)
-    assert str(left) == "7 s left in all"
-    assert str(TimeLeft(0.0, 3 * 3600 + 300)) == "3 h 5 min left in all"
+    first, *_, last = divide(CONFIG, record.own)
+    evaluation = VIEW_COST * (photos + tests)
+    assert session.work_after(last, tiny_scene) == VIEW_COST * passes * photos + evaluation
+    whole = first.config.iterations + session.work_after(first, tiny_scene)
+    assert whole == CONFIG.iterations + VIEW_COST * 3 * passes * photos + evaluation
+    assert time_left(90.0) == "90 s left in all" and time_left(1800.0) == "30 min left in all"
+    assert time_left(3 * 3600 + 300) == "3 h 5 min left in all"
