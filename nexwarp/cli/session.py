@@ -139,15 +139,11 @@ class Session(StageStore):
                     self.ranks.barrier()
                     raise Stopped(number)
 
-            def warn(text: str) -> None:
-                if self.ranks.first:
-                    display.warn(self.console, text)
-                    log.rewind()
-
             try:
-                trainer.run(observe, warn)
+                trainer.run(observe)
             except DivergedError as error:
-                raise self._diverged(folder, trainer, error) from None
+                kept = "the last checkpoint stays" if has_checkpoint(folder) else "there is no checkpoint"
+                raise DivergedError(f"{error}; {kept}") from None
 
     def work_after(self, stage: Stage, scene: Scene) -> float:
         """Return what follows the steps of a stage, in training steps: its finish, later stages, and the evaluation."""
@@ -190,18 +186,6 @@ class Session(StageStore):
         if has_checkpoint(self.run):
             raise RunError(f"{folder}: expected the complete teacher that the student in {self.run} has learned from")
         return None
-
-    def _diverged(self, folder: Path, trainer: Trainer, error: DivergedError) -> DivergedError:
-        """Write the last good model, which the trainer has restored; return the error to raise."""
-        outcome = f"the model of iteration {trainer.iteration:,} is in {folder}"
-        try:
-            if self.ranks.first:
-                save_model(folder, trainer.model())
-        except OSError as problem:
-            outcome = f"the model of iteration {trainer.iteration:,} could not be saved ({problem})"
-        outcome = str(self.ranks.share(outcome))
-        self.ranks.barrier()
-        return DivergedError(f"{error}; {outcome}")
 
     def _write(self, stage: Stage, trainer: Trainer) -> Model:
         """Finish and write the model of a stage, its cameras and figures; a student's have the time of its teachers."""

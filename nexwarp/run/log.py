@@ -47,7 +47,10 @@ class TrainingLog:
             # Events after this iteration, which is trained again, are hidden.
             hidden = self.trainer.iteration + 1 if self.trainer.iteration else None
             self.events = SummaryWriter(str(self.path.parent / TENSORBOARD_FOLDER), purge_step=hidden)
-        self._open()
+        keep_lines(self.path, self.trainer.iteration)
+        self.file = _open_log(self.path)
+        self.last = self.trainer.iteration
+        self.written = time.perf_counter()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -58,18 +61,6 @@ class TrainingLog:
             except OSError:  # a full disk: an exception that is already being raised must not be replaced
                 if kind is None:
                     raise
-
-    def rewind(self) -> None:
-        """Drop the lines after the trainer's iteration; for a trainer that was restored to an earlier one."""
-        assert self.file is not None
-        self.file.close()
-        self._open()
-
-    def _open(self) -> None:
-        keep_lines(self.path, self.trainer.iteration)
-        self.file = _open_log(self.path)
-        self.last = self.trainer.iteration
-        self.written = time.perf_counter()
 
     def __call__(self, step: StepReport) -> None:
         """Write a line if one is due after this step."""

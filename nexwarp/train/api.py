@@ -1,6 +1,5 @@
 """Training from Python."""
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 
 import torch
@@ -38,7 +37,7 @@ def train(
         config: settings; None is `nexwarp.preset("default")`.
         device: where to train; None is CUDA where there is a device, else the CPU.
         callbacks: functions that are called with a `StepReport` after each step, first those of teachers that the run
-            trains. One that raises stops it; its exception is passed on. After divergence, steps are reported again.
+            trains. One that raises stops it; its exception is passed on.
         losses: own losses by name: functions of the step's `Rendering`, at the photo's exposure, and its `Target`
             (`target.photo` (H, W, 3), `target.camera`, `target.background`, `target.counts`) that return a scalar
             tensor. They are added to ours as they are, so that factors are their own business, and appear in
@@ -68,7 +67,7 @@ def train(
     Raises:
         SceneError: the scene has no training views.
         TypeError, ValueError: naming the argument that does not fit.
-        DivergedError: numbers were not finite, again after going back once.
+        DivergedError: numbers are not finite.
         OutOfMemoryError: memory does not suffice; the message says what to lower.
     """
     if not isinstance(scene, Scene):
@@ -86,10 +85,7 @@ def train(
         for callback in observers:
             callback(report)
 
-    def warn(message: str) -> None:
-        warnings.warn(message, stacklevel=2)
-
-    store = StageStore(observe, warn)
+    store = StageStore(observe)
     runner = StageRunner(scene, config, device, store, losses=losses, optimizer=optimizer, teachers=teachers, **start)
     runner.train()
     return runner.finish()

@@ -162,13 +162,12 @@ def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
     return ends | {"means": (ends["means"][0] * scale, ends["means"][1] * scale)}
 
 
-def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int, factor: float) -> None:
-    """Set the rates of a step, counted from 1: log-linear between the ends of each group, times a factor."""
+def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int) -> None:
+    """Set the rates of a step, counted from 1: log-linear between the ends of each group."""
     progress = (iteration - 1) / max(iterations - 1, 1)
     for group in optimizer.param_groups:
         first, last = group["ends"]
         rate = math.exp((1 - progress) * math.log(first) + progress * math.log(last)) if first else 0.0
-        rate *= factor
         if isinstance(group["lr"], torch.Tensor):
             group["lr"].fill_(rate)
         else:

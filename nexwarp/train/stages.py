@@ -113,8 +113,8 @@ class StageStore:
     Iterations are reported counted over all stages.
     """
 
-    def __init__(self, observe: Observer | None = None, warn: Callable[[str], None] = lambda _: None) -> None:
-        self.observe, self.warn = observe, warn
+    def __init__(self, observe: Observer | None = None) -> None:
+        self.observe = observe
 
     def complete(self, stage: Stage) -> Model | None:
         """Return the model of a teacher that an earlier session has finished; None where there is none."""
@@ -125,7 +125,7 @@ class StageStore:
 
     def train(self, stage: Stage, trainer: Trainer) -> None:
         """Do all steps of a stage."""
-        trainer.run(self.observe and partial(self._report, stage.before), self.warn)
+        trainer.run(self.observe and partial(self._report, stage.before))
 
     def _report(self, before: int, report: StepReport) -> None:
         assert self.observe is not None

@@ -43,7 +43,6 @@ class TrainingState:
         order: indices of the views that are left of the epoch, the next one last.
         iteration: steps done.
         seconds: that the steps took, in all sessions of the run.
-        rate_factor: multiplies all learning rates; less than 1 after the run has gone back.
     """
 
     background: tuple[float, float, float]
@@ -78,7 +77,6 @@ class TrainingState:
         self.order: list[int] = []
         self.iteration = 0
         self.seconds = 0.0
-        self.rate_factor = 1.0
 
     # Not to be assigned: the optimizer would go on to train the old ones.
     @property
@@ -148,7 +146,6 @@ class TrainingState:
         if self.device.type == "cuda":
             tensors["rng.cuda"] = torch.cuda.get_rng_state(self.device)
         state: dict[str, Any] = {"iteration": self.iteration, "seconds": self.seconds, "order": list(self.order)}
-        state["rate_factor"] = self.rate_factor
         if optimizer is not None:
             state["optimizer"] = optimizer
         return Snapshot({name: x.detach().to("cpu", copy=True) for name, x in tensors.items()}, state)
@@ -174,7 +171,6 @@ class TrainingState:
         self.order = list(state["order"])
         self.iteration = state["iteration"]
         self.seconds = state["seconds"]
-        self.rate_factor = state["rate_factor"]
 
 
 def _part(tensors: Mapping[str, torch.Tensor], prefix: str, names: Iterable[str]) -> dict[str, torch.Tensor]:

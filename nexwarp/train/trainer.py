@@ -11,7 +11,7 @@ from typing_extensions import Unpack
 
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene
-from nexwarp.errors import DivergedError, OutOfMemoryError, SceneError
+from nexwarp.errors import OutOfMemoryError, SceneError
 from nexwarp.machine import deterministic, needed_memory, seed_everything, torch_threads
 from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, can_capture, graph_key, updating
 from nexwarp.model.model import Model
@@ -28,8 +28,6 @@ from nexwarp.train.state import TrainingState, check_origin, check_snapshot, che
 from nexwarp.train.target import Target, TargetSource, TaughtTargets, check_teachers, refined, teachers_digest
 
 CHECK_EVERY = 100  # iterations between checks that all numbers are finite
-SNAPSHOTS = 10  # that a run takes, one replacing the other
-LOWERED_RATES = 0.5  # factor of the rates after a run has gone back
 
 
 class Trainer(TrainingState):
@@ -89,57 +87,31 @@ class Trainer(TrainingState):
         self.views, self.background = self.targets.views, self.targets.background
         self.views_a_step = 1
         self.noted: list[tuple[int, str, torch.Tensor]] = []  # losses since the last check
-        self.good: Snapshot | None = None
 
-    def run(
-        self,
-        observe: Callable[[StepReport], None] | None = None,
-        warn: Callable[[str], None] = lambda _: None,
-        until: int | None = None,
-    ) -> None:
+    def run(self, observe: Callable[[StepReport], None] | None = None, until: int | None = None) -> None:
         """Train until `config.iterations`, or `until` an earlier one, calling `observe` after each step.
 
         Losses, parameters and the optimizer's state are checked every CHECK_EVERY iterations, before each checkpoint
-        and at the end. Where one is not finite, training goes back to the last good state, once, with half the
-        learning rates, and tells `warn`.
+        and at the end.
 
         Raises:
-            DivergedError: something was not finite again; the trainer is in its last good state.
+            DivergedError: something is not finite.
             OutOfMemoryError: a step needs more memory than there is; the trainer is in the middle of that step.
         """
         total = self.config.iterations
         last = total if until is None else min(until, total)
-        if self.iteration < last:
-            self.good = self.snapshot()
         with torch_threads(self.views.torch_threads(self.config.max_hits)):
             while self.iteration < last:
                 try:
                     report = self._timed_step(last)
-                    keep = report.passed(max(total // SNAPSHOTS, 1))
-                    if keep or report.passed(CHECK_EVERY) or self.iteration >= last:
+                    if report.passed(CHECK_EVERY) or self.iteration >= last:
                         self.check()
-                    if keep:
-                        self.good = self.snapshot()
                     if observe is not None:
                         observe(report)
-                except DivergedError as fault:
-                    self._go_back(fault, warn)
                 except (MemoryError, RuntimeError) as error:
                     if (needed := needed_memory(error)) is None:
                         raise
                     raise OutOfMemoryError(oom_message(self, needed, graphs=self.graphs is not None)) from error
-
-    def _go_back(self, fault: DivergedError, warn: Callable[[str], None]) -> None:
-        """Return to the last good state with half the learning rates; raise where the run had gone back before."""
-        assert self.good is not None
-        again = self.rate_factor < 1.0
-        self.load_snapshot(self.good)
-        self.rate_factor = LOWERED_RATES
-        if again:
-            raise DivergedError(
-                f"{fault}; it had gone back and halved its learning rates before, so training gives up"
-            ) from None
-        warn(f"{fault}; going back to iteration {self.iteration:,} with half the learning rates")
 
     def _timed_step(self, last: int) -> StepReport:
         """Do a step, count its time, and note its losses for the next check."""
@@ -156,7 +128,7 @@ class Trainer(TrainingState):
         fixed_order = deterministic(self.config.deterministic and self.device.type == "cuda")
         with fixed_order, torch.autocast(self.device.type, enabled=False):
             target = self._next_target()
-            set_rates(self.optimizer, self.iteration, self.config.iterations, self.rate_factor)
+            set_rates(self.optimizer, self.iteration, self.config.iterations)
             result = self._run_step(target)
             if self.densifier.due(self.iteration, self.views_a_step):
                 self._control_density()
@@ -260,9 +232,7 @@ class Trainer(TrainingState):
     def save_checkpoint(self, run: Path) -> None:
         """Write a checkpoint into a folder; DivergedError where something is not finite, OSError on a failing disk."""
         self.check()
-        if self.good is None or self.good.state["iteration"] != self.iteration:
-            self.good = self.snapshot()
-        self._write(run, self.good)
+        self._write(run, self.snapshot())
 
     def _write(self, run: Path, snapshot: Snapshot) -> None:
         save_checkpoint(run, *snapshot)

@@ -62,7 +62,7 @@ def test_its_schedules_are_those_of_the_longer_run(trained: Path, scene: Path) -
     assert trainer.iteration == 20
     trainer.step()
     rates = [group["lr"] for group in trainer.optimizer.param_groups]
-    set_rates(trainer.optimizer, 21, 30, 1.0)
+    set_rates(trainer.optimizer, 21, 30)
     assert rates == [group["lr"] for group in trainer.optimizer.param_groups]
     fresh = Trainer(load_scene(scene), longer, "cpu")
     assert trainer.densifier.config == fresh.densifier.config

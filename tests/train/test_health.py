@@ -1,4 +1,4 @@
-"""Numbers that are not finite are found, named, gone back from once, then given up; memory that does not suffice."""
+"""Numbers that are not finite are found and named; memory that does not suffice."""
 
 import dataclasses
 import json
@@ -60,7 +60,7 @@ def poison(where: str, value: float = NAN) -> Callable[[Trainer], None]:
 
 
 def inject(patch: pytest.MonkeyPatch, iterations: set[int], spoil: Callable[[Trainer], None]) -> list[int]:
-    """Let a fault strike before Adam's step of some iterations, each time they come; returns those it struck."""
+    """Let a fault strike before Adam's step of some iterations; returns those it struck."""
     struck: list[int] = []
     trainers: list[Trainer] = []
     init = Trainer.__init__
@@ -84,15 +84,6 @@ def inject(patch: pytest.MonkeyPatch, iterations: set[int], spoil: Callable[[Tra
     return struck
 
 
-class Once(set[int]):
-    """Iterations that are met once each."""
-
-    def __contains__(self, iteration: object) -> bool:
-        there = super().__contains__(iteration)
-        self.discard(iteration)
-        return there
-
-
 @pytest.mark.parametrize(("value", "place"), [(NAN, 0), (INF, 4999), (-INF, 9999)])
 def test_any_value_that_is_not_finite_is_found(device, value, place):
     tensors = {name: torch.randn(10_000, device=device) for name in ("a", "b", "c")}
@@ -106,57 +97,29 @@ def test_any_value_that_is_not_finite_is_found(device, value, place):
     ("where", "value"),
     [("gradient surfels.means", NAN), ("gradient texture.grid", INF), ("parameter surfels.raw_quats", NAN)],
 )
-def test_a_fault_is_found_named_and_gone_back_from(scene, monkeypatch, where, value):
-    """Struck once at iteration 13: told by 16, the next look; back at 12, the last good state, with half the rates."""
-    struck = inject(monkeypatch, Once({13}), poison(where, value))
-    told: list[str] = []
+def test_a_fault_ends_the_training_and_is_named(scene, monkeypatch, where, value):
+    """Struck at iteration 13: told by 14, the next look, before anybody is told of 14."""
+    monkeypatch.setattr(trainer, "CHECK_EVERY", 7)
+    struck = inject(monkeypatch, {13}, poison(where, value))
     run, seen = Trainer(scene, SMALL, "cpu"), []
-    run.run(lambda step: seen.append((step.iteration, run.optimizer.param_groups[0]["lr"])), told.append)
-    assert struck == [13] and len(told) == 1
-    assert "iteration 1" in told[0] and "going back to iteration 12 with half the learning rates" in told[0]
-    assert "\n" not in told[0]
-    again = [i for i, (iteration, _) in enumerate(seen) if iteration == 13]
-    assert len(again) == 2 and seen[again[1] - 1][0] <= 16
-    assert seen[again[1]][1] == pytest.approx(seen[again[0]][1] / 2)
-    assert run.iteration == 40 and run.rate_factor == 0.5
-    assert not_finite(dict(run._named_parameters())) == []
+    with pytest.raises(DivergedError, match=r"iteration 1[34]: ") as caught:
+        run.run(lambda step: seen.append(step.iteration))
+    assert isinstance(caught.value, (NexwarpError, RuntimeError)) and "\n" not in str(caught.value)
+    assert struck == [13] and seen == list(range(1, 14))
 
 
 def test_a_bad_loss_is_named_with_its_iteration(scene, monkeypatch):
     run = Trainer(scene, SMALL, "cpu")
-    told: list[str] = []
 
     def spoilt(*args: Any, **options: Any) -> dict[str, torch.Tensor]:
         terms = step_losses(*args, **options)
-        if run.iteration == 14 and run.rate_factor == 1.0:
+        if run.iteration == 14:
             terms["dssim"] = terms["dssim"] * NAN
         return terms
 
     monkeypatch.setattr(trainer, "step_losses", spoilt)
-    run.run(warn=told.append)
-    assert len(told) == 1 and told[0].startswith("iteration 14: the loss 'dssim' is nan; "), told
-
-
-def test_what_happens_again_is_given_up(scene, monkeypatch):
-    struck = inject(monkeypatch, {22}, poison("gradient surfels.log_scales"))
-    run = Trainer(scene, SMALL, "cpu")
-    told: list[str] = []
-    with pytest.raises(DivergedError, match="halved its learning rates before, so training gives up") as caught:
-        run.run(warn=told.append)
-    assert isinstance(caught.value, (NexwarpError, RuntimeError)) and "\n" not in str(caught.value)
-    assert struck == [22, 22] and len(told) == 1
-    assert run.iteration == 20 and run.rate_factor == 0.5
-    assert not_finite(run._watched()) == []  # the trainer is in its last good state
-
-
-def test_faults_are_looked_for_every_so_often(scene, monkeypatch):
-    monkeypatch.setattr(trainer, "CHECK_EVERY", 7)
-    monkeypatch.setattr(trainer, "SNAPSHOTS", 1)
-    inject(monkeypatch, Once({15}), poison("gradient surfels.means"))
-    run, seen = Trainer(scene, SMALL, "cpu"), []
-    run.run(lambda step: seen.append(step.iteration))
-    # The look at 21 finds it before anybody is told of 21; the only state to go back to is the first.
-    assert seen == [*range(1, 21), *range(1, 41)]
+    with pytest.raises(DivergedError, match=r"^iteration 14: the loss 'dssim' is nan; "):
+        run.run()
 
 
 def test_nothing_that_is_not_finite_is_ever_saved(scene, tmp_path, monkeypatch):
@@ -171,30 +134,13 @@ def test_nothing_that_is_not_finite_is_ever_saved(scene, tmp_path, monkeypatch):
     assert run.iteration == 1 and not_finite(run._watched()) == []
 
 
-def test_the_lowered_rate_is_kept_over_a_resume(scene, tmp_path):
-    first, second = Trainer(scene, SMALL, "cpu"), Trainer(scene, SMALL, "cpu")
-    first.rate_factor = 0.5
-    first.step()
-    first.save(tmp_path)
-    second.restore(str(tmp_path))
-    assert second.rate_factor == 0.5
-    for one in (first, second):
-        one.step()
-    assert first.optimizer.param_groups[0]["lr"] == second.optimizer.param_groups[0]["lr"]
-    assert torch.equal(first.surfels.means, second.surfels.means)
-
-
-def test_the_command_line_gives_up_with_a_model(folder, tmp_path, monkeypatch, capsys):
+def test_the_command_line_names_the_fault_and_keeps_the_checkpoint(folder, tmp_path, monkeypatch, capsys):
     run = tmp_path / "run"
     inject(monkeypatch, {22}, poison("gradient surfels.means"))
     assert cli.main(["train", str(folder), "--run", str(run), *FLAGS]) == 2
-    out, err = capsys.readouterr()
-    assert "warning: " in out and "going back to iteration 20 with half the learning rates" in out
-    assert err.startswith("nexwarp: error: ") and err.count("\n") == 1
-    assert "gives up" in err and f"the model of iteration 20 is in {run}" in err
-    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert [line["iteration"] for line in lines] == list(range(1, len(lines) + 1))  # none of the other future
-    assert nw.load(run).meta["iteration"] == 20
+    err = capsys.readouterr().err
+    assert err.startswith("nexwarp: error: iteration 2") and err.count("\n") == 1
+    assert err.endswith("; the last checkpoint stays\n")
     assert json.loads((run / "checkpoint" / "state.json").read_text())["iteration"] == 20
 
 
