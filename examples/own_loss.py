@@ -1,12 +1,11 @@
-"""Train with a loss and an optimizer of one's own.
+"""Train with a loss of one's own.
 
-python examples/own_loss.py --steps 500 --weight 0.5 --optimizer radam
+python examples/own_loss.py --steps 500 --weight 0.5
 """
 
 import argparse
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import torch
 
@@ -23,18 +22,12 @@ def edge_loss(weight: float) -> Callable[[nw.Rendering, nw.Target], torch.Tensor
     return loss
 
 
-def make_radam(groups: list[dict[str, Any]]) -> torch.optim.Optimizer:
-    """RAdam; each group has `params`, `name` and `lr`, and the schedule goes on to drive `lr`."""
-    return torch.optim.RAdam(groups, eps=1e-15)
-
-
 def main() -> None:
     """Train, and tell how the own loss and the PSNR change."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--weight", type=float, default=0.5)
     parser.add_argument("--downscale", type=int, default=4, help="reduce the demo's photos of 96x72 by this factor")
-    parser.add_argument("--optimizer", choices=("adam", "radam"), default="adam")
     args = parser.parse_args()
     demo = nw.load_scene("demo", downscale=args.downscale)
     config = dataclasses.replace(nw.preset("default"), iterations=args.steps, max_surfels=2000)
@@ -43,8 +36,7 @@ def main() -> None:
     def keep(step: nw.StepReport) -> None:
         reports.append((step.losses["edges"].item(), step.psnr()))
 
-    optimizer = make_radam if args.optimizer == "radam" else None
-    nw.train(demo, config, callbacks=[keep], losses={"edges": edge_loss(args.weight)}, optimizer=optimizer)
+    nw.train(demo, config, callbacks=[keep], losses={"edges": edge_loss(args.weight)})
     tenth = max(len(reports) // 10, 1)
     for name, part in (("first", reports[:tenth]), ("last", reports[-tenth:])):
         edges, psnr = torch.tensor(part).mean(dim=0).tolist()

@@ -588,13 +588,6 @@ def _kind(target: Any) -> Hashable:
     return tuple(parts)
 
 
-def can_capture(optimizer: torch.optim.Optimizer) -> bool:
-    """Whether an optimizer's step can be captured: it says so, and its learning rates are tensors on the GPU."""
-    rates = [group["lr"] for group in optimizer.param_groups if group.get("capturable")]
-    on_gpu = all(isinstance(rate, torch.Tensor) and rate.is_cuda for rate in rates)
-    return on_gpu and len(rates) == len(optimizer.param_groups)
-
-
 def graph_key(
     options: RenderOptions, optimizer: torch.optim.Optimizer, tensors: Sequence[torch.Tensor], *, densify: bool
 ) -> GraphKey:

@@ -9,7 +9,6 @@ from nexwarp.data import Scene
 from nexwarp.model.model import Model
 from nexwarp.train.initial import Start, check_start
 from nexwarp.train.losses import OwnLoss
-from nexwarp.train.optimizer import OptimizerMaker
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.stages import StageRunner, StageStore
@@ -24,7 +23,6 @@ def train(
     device: torch.device | str | None = None,
     callbacks: Iterable[Callback] = (),
     losses: Mapping[str, OwnLoss] | None = None,
-    optimizer: OptimizerMaker | None = None,
     teachers: Iterable[Model] = (),
     **start: Unpack[Start],
 ) -> Model:
@@ -45,12 +43,6 @@ def train(
             tensors, which it reads in place, but not on numbers that change in Python, for which set
             `config.cuda_graphs` to False. A loss that cannot be captured, such as one that calls `item()`, warns, and
             steps are launched one by one.
-        optimizer: function from a list of parameter groups, dictionaries with `params`, `name` and `lr`, to any
-            `torch.optim.Optimizer` that keeps these groups; None is Adam. Each group's `lr` is that of the first step,
-            and may be changed; a schedule sets `group["lr"]` before each step, and keeps the ratio of the last rate to
-            the first one. When surfels are split or removed, state tensors of their parameter's shape get the same
-            rows, and zeros for new surfels; all other state is kept. An own optimizer runs in CUDA graphs if its groups
-            have `capturable=True` and learning rates that are tensors on the GPU; else without.
         teachers: trained models of the scene, in place of the run's own (`config.teachers`); they are moved to the
             device. Every other step compares with a rendering of one, at the mean exposure, from a camera on the line
             through those of two photos.
@@ -86,6 +78,6 @@ def train(
             callback(report)
 
     store = StageStore(observe)
-    runner = StageRunner(scene, config, device, store, losses=losses, optimizer=optimizer, teachers=teachers, **start)
+    runner = StageRunner(scene, config, device, store, losses=losses, teachers=teachers, **start)
     runner.train()
     return runner.finish()

@@ -13,10 +13,8 @@ import torch
 from nexwarp import ops
 from nexwarp.kernels.photometric import WEIGHT_EPSILON
 from nexwarp.model.render import Rendering
-from nexwarp.model.texture import NeuralTexture
 from nexwarp.ops.photometric import photometric_terms
 from nexwarp.ops.ssim import weighted_dssim
-from nexwarp.train.optimizer import FusedAdam
 from nexwarp.train.recipe import LossWeights
 from nexwarp.train.state import TrainingState
 from nexwarp.train.target import Target
@@ -132,12 +130,6 @@ def depth_map_loss(depths: torch.Tensor, weights: torch.Tensor, expected: torch.
     return errors.sum() / known.sum().clamp_min(1)
 
 
-def grid_loss(grid: torch.Tensor, resolutions: torch.Tensor) -> torch.Tensor:
-    """L_grid = sum_l sum(H_l^2) / s_l^3 of a grid (L, T, F). The paper prints H without its square, which is meant."""
-    # A norm: its forward pass makes no (L, T, F) temporary, its backward pass only the gradient itself.
-    return (torch.linalg.vector_norm(grid, dim=(1, 2)).square() / resolutions**3).sum()
-
-
 def normal_loss(out: Rendering, counts: torch.Tensor | None = None) -> torch.Tensor:
     """Mean over pixels of sum over hits of weight * (1 - n . N), with N the normal of the median depths' map.
 
@@ -199,10 +191,10 @@ def step_losses(
 ) -> dict[str, torch.Tensor]:
     """Return the terms of a step's loss by name, multiplied by their factors: their sum is the loss.
 
-    The rendering is that of the target's camera, `as_taken`. The grid's term is left out where the optimizer, a
-    `FusedAdam`, computes it. Losses of one's own are added as they are.
+    The rendering is that of the target's camera, `as_taken`. The grid's term is left out: the optimizer computes it.
+    Losses of one's own are added as they are.
     """
-    config, texture, factors = state.config, state.texture, state.config.losses
+    texture, factors = state.texture, state.config.losses
     losses = photo_losses(
         out.image.clamp(0, 1),  # as the authors' code does
         out.textured,
@@ -215,9 +207,6 @@ def step_losses(
     )
     if factors.opacity > 0:
         losses["opacity"] = factors.opacity * state.surfels.opacities.mean()
-    regular = config.max_hits > 0 and factors.grid > 0 and not isinstance(state.optimizer, FusedAdam)
-    if regular and isinstance(texture, NeuralTexture):
-        losses["grid"] = factors.grid * grid_loss(texture.grid, texture.resolutions * state.cells_unit)
     if target.empty is not None and factors.empty > 0:
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:

@@ -22,7 +22,6 @@ EPSILON = 1e-15  # the paper's
 RATED = (*PARAMETERS, "grid", "mlp")  # the groups of the fields of `LearningRates`, in their order
 # First and last learning rates of pose corrections, radians and scene scales, in a run of 30,000 steps.
 POSE_RATES = (2e-4, 2e-6)
-OptimizerMaker = Callable[[list[ParameterGroup]], torch.optim.Optimizer]
 
 
 class FusedAdam(torch.optim.Adam):
@@ -101,7 +100,10 @@ class FusedAdam(torch.optim.Adam):
 
 
 def grid_factors(texture: NeuralTexture, weights: LossWeights, cells_unit: float) -> torch.Tensor | None:
-    """Return the factors (L,) of the grid's loss, of which `losses.grid_loss` has 1 / s^3; None without any."""
+    """Return the factors (L,) of the grid's loss, sum_l sum(H_l^2) / s_l^3; None without any.
+
+    The paper prints H without its square, which is meant.
+    """
     return weights.grid / (texture.resolutions * cells_unit) ** 3 if weights.grid > 0 else None
 
 
@@ -110,15 +112,13 @@ def make_optimizer(
     texture: Texture,
     config: Config,
     scale: float,
-    make: OptimizerMaker | None = None,
     cells_unit: float = 1.0,
     poses: PoseCorrections | None = None,
-) -> torch.optim.Optimizer:
-    """Make the optimizer of surfels, of the texture unless K is 0, and of pose corrections.
+) -> FusedAdam:
+    """Make the optimizer of surfels, of the texture unless K is 0, and of pose corrections; it regularises the grid.
 
     Each of its groups gets the ends of its schedule as `group["ends"]`. The means' rates follow the scene's scale,
-    world units; `cells_unit` are the world units in which the grid's loss counts its cells. `make` makes an optimizer
-    of one's own; None makes a `FusedAdam`, which regularises the grid.
+    world units; `cells_unit` are the world units in which the grid's loss counts its cells.
     """
     ends = rate_ends(config, scale)
     parts = {name: [getattr(surfels, name)] for name in PARAMETERS}
@@ -131,23 +131,13 @@ def make_optimizer(
         parts["texture"], ends["texture"] = list(rest.values()), texture.rates
     if poses is not None:
         parts["poses"] = [poses.corrections]
-    groups: list[ParameterGroup] = [{"params": x, "name": name, "lr": ends[name][0]} for name, x in parts.items()]
-    if make is None and surfels.device.type == "cuda":  # rates that a CUDA graph reads
+    groups: list[ParameterGroup] = [
+        {"params": x, "name": name, "lr": ends[name][0], "ends": ends[name]} for name, x in parts.items()
+    ]
+    if surfels.device.type == "cuda":  # rates that a CUDA graph reads
         groups = [group | {"lr": torch.tensor(group["lr"], device=surfels.device)} for group in groups]
-    optimizer = FusedAdam(groups, eps=EPSILON) if make is None else make(groups)
-    if not isinstance(optimizer, torch.optim.Optimizer):
-        raise TypeError(f"optimizer: expected it to return a torch.optim.Optimizer, got {type(optimizer).__name__}")
-    expected = {name: {id(x) for x in values} for name, values in parts.items()}
-    if {g.get("name"): {id(x) for x in g["params"]} for g in optimizer.param_groups} != expected:
-        names = ", ".join(str(group.get("name")) for group in optimizer.param_groups)
-        raise ValueError(f"optimizer: expected it to keep the parameter groups {', '.join(parts)}, got {names}")
-    for group in optimizer.param_groups:
-        first, last = ends[group["name"]]
-        rate = float(group["lr"])
-        if not math.isclose(rate, first, rel_tol=1e-6):  # it was changed; a rate on the GPU is rounded to float32
-            first, last = rate, rate * last / first if first else rate
-        group["ends"] = first, last
-    if isinstance(optimizer, FusedAdam) and isinstance(texture, NeuralTexture) and config.max_hits:
+    optimizer = FusedAdam(groups, eps=EPSILON)
+    if isinstance(texture, NeuralTexture) and config.max_hits:
         optimizer.regularise(texture, grid_factors(texture, config.losses, cells_unit))
     return optimizer
 

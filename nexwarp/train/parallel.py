@@ -199,10 +199,9 @@ def scale_for_batch(optimizer: torch.optim.Optimizer, views: int) -> None:
 
     The square-root rule for Adam (Malladi et al. 2022, On the SDEs and scaling rules for adaptive gradient algorithms):
     rates are multiplied by the square root of the number of views, and moments forget as much in a step as in that
-    many steps of one view. Other optimizers keep their other settings.
+    many steps of one view.
     """
     for group in optimizer.param_groups:
         first, last = group["ends"]
         group["ends"] = first * math.sqrt(views), last * math.sqrt(views)
-        if isinstance(optimizer, torch.optim.Adam):
-            group["betas"] = tuple(beta**views for beta in group["betas"])
+        group["betas"] = tuple(beta**views for beta in group["betas"])

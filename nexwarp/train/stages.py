@@ -159,7 +159,7 @@ class StageRunner:
         """Make the trainer of the first stage that is not complete; no step is done yet.
 
         `own` are the teachers that the run trains: None plans them, or none where `teachers`, models, are given
-        instead. `extensions` are `losses` and `optimizer` of `nexwarp.train`, and what the student starts from.
+        instead. `extensions` are the `losses` of `nexwarp.train`, and what the student starts from.
         """
         self.scene, self.device, self.store, self.ranks, self.extensions = scene, device, store, ranks, extensions
         # `Trainer` says what is wrong with it.

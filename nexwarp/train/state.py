@@ -23,10 +23,10 @@ from nexwarp.ops.tiles import Order
 from nexwarp.train.checkpoint import Snapshot
 from nexwarp.train.densify import DensityControl
 from nexwarp.train.initial import Start, cells_unit, given_surfels, initial_poses, initial_surfels, initial_texture
-from nexwarp.train.optimizer import FusedAdam, OptimizerMaker, make_optimizer
+from nexwarp.train.optimizer import FusedAdam, make_optimizer
 from nexwarp.train.recipe import Config, config_from_dict, refuse_removed
 
-ADAM_STATE = ("step", "exp_avg", "exp_avg_sq", "max_exp_avg_sq")  # their names, those of amsgrad too
+ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")
 CPU_GENERATOR = 5056  # bytes of the state of a generator on a CPU, a Mersenne twister
 TWISTER = 624  # numbers that it makes at a time
 FLOATS = ("surfels.", "texture.", "own_texture.", "poses.", "adam.", "densify.")  # of tensors that are float32
@@ -53,7 +53,6 @@ class TrainingState:
         config: Config,
         device: torch.device,
         colors: torch.Tensor | None = None,
-        optimizer: OptimizerMaker | None = None,
         start: Start | None = None,
     ) -> None:
         """Make the initial surfels, of the points' `colors` (P, 3) or else the scene's own, and the texture.
@@ -64,7 +63,6 @@ class TrainingState:
         self.scene = scene
         self.config = config
         self.device = device
-        self.own_optimizer = optimizer
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = torch.Generator(device).manual_seed(config.seed)
         surfels = given_surfels(config, start) or initial_surfels(scene, config, self.generator, colors)
@@ -89,9 +87,8 @@ class TrainingState:
         """The texture in training."""
         return self._texture
 
-    def _make_optimizer(self) -> torch.optim.Optimizer:
-        options = (self.config, self.scene.scale, self.own_optimizer, self.cells_unit, self.poses)
-        return make_optimizer(self.surfels, self.texture, *options)
+    def _make_optimizer(self) -> FusedAdam:
+        return make_optimizer(self.surfels, self.texture, self.config, self.scene.scale, self.cells_unit, self.poses)
 
     def _parts(self) -> dict[str, torch.nn.Module]:
         """Return what is trained, by the first words of the names in a checkpoint."""
@@ -105,8 +102,8 @@ class TrainingState:
             yield from ((f"{part}.{name}", x) for name, x in module.named_parameters())
 
     def take_grid_loss(self) -> dict[str, torch.Tensor]:
-        """Return the grid's term of the loss, where the optimizer computes it, once after each of its steps."""
-        if not isinstance(self.optimizer, FusedAdam) or self.optimizer.grid_loss is None:
+        """Return the grid's term of the loss, which the optimizer computes, once after each of its steps."""
+        if self.optimizer.grid_loss is None:
             return {}
         loss, self.optimizer.grid_loss = self.optimizer.grid_loss, None
         return {"grid": loss}
@@ -139,15 +136,14 @@ class TrainingState:
     def snapshot(self) -> Snapshot:
         """Return copies on the CPU of everything that shapes the future."""
         tensors = {f"{part}.{name}": x for part, m in self._parts().items() for name, x in m.state_dict().items()}
-        moments, optimizer = gather_optimizer(self.optimizer, dict(self._named_parameters()))
-        tensors |= moments | {"densify.errors": self.densifier.errors}
+        for name, parameter in self._named_parameters():
+            tensors |= {f"adam.{name}.{key}": x for key, x in self.optimizer.state.get(parameter, {}).items()}
+        tensors["densify.errors"] = self.densifier.errors
         tensors |= {"rng.views": self.generator.get_state(), "rng.noise": self.noise.get_state()}
         tensors["rng.torch"] = torch.get_rng_state()
         if self.device.type == "cuda":
             tensors["rng.cuda"] = torch.cuda.get_rng_state(self.device)
         state: dict[str, Any] = {"iteration": self.iteration, "seconds": self.seconds, "order": list(self.order)}
-        if optimizer is not None:
-            state["optimizer"] = optimizer
         return Snapshot({name: x.detach().to("cpu", copy=True) for name, x in tensors.items()}, state)
 
     def load_snapshot(self, snapshot: Snapshot) -> None:
@@ -158,7 +154,7 @@ class TrainingState:
         if self.poses is not None:
             self.poses.load(tensors["poses.corrections"])
         self.optimizer = self._make_optimizer()
-        restore_optimizer(self.optimizer, dict(self._named_parameters()), tensors, state.get("optimizer"))
+        self._load_moments(tensors)
         self.densifier = DensityControl(self.surfels, self.config)
         if tensors["densify.errors"].shape != self.densifier.errors.shape:
             raise ValueError(f"densify.errors: expected one for each of {len(self.surfels)} surfels")
@@ -171,6 +167,18 @@ class TrainingState:
         self.order = list(state["order"])
         self.iteration = state["iteration"]
         self.seconds = state["seconds"]
+
+    def _load_moments(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        """Put a snapshot's state of Adam into a fresh optimizer."""
+        for name, parameter in self._named_parameters():
+            values = _part(tensors, f"adam.{name}.", ADAM_STATE)
+            for key, value in values.items():
+                if value.shape != (() if key == "step" else parameter.shape):
+                    shape = tuple(parameter.shape)
+                    raise ValueError(f"adam.{name}.{key}: expected the shape of its parameter, {shape}")
+                values[key] = value.to(parameter.device)
+            if values:
+                self.optimizer.state[parameter] = values
 
 
 def _part(tensors: Mapping[str, torch.Tensor], prefix: str, names: Iterable[str]) -> dict[str, torch.Tensor]:
@@ -189,56 +197,6 @@ def _load_texture(texture: Texture, state: dict[str, torch.Tensor]) -> None:
     texture.load_state_dict(state)
 
 
-def _is_adam(optimizer: torch.optim.Optimizer) -> bool:
-    return type(optimizer) in (torch.optim.Adam, FusedAdam)  # which have the same state
-
-
-def gather_optimizer(
-    optimizer: torch.optim.Optimizer, parameters: Mapping[str, torch.nn.Parameter]
-) -> tuple[dict[str, torch.Tensor], dict[str, Json] | None]:
-    """Return the tensors of an optimizer's state, and the rest of it; None for Adam, which has only tensors."""
-    prefix = "adam." if _is_adam(optimizer) else "optimizer."
-    tensors: dict[str, torch.Tensor] = {}
-    values: dict[str, Json] = {}
-    for name, parameter in parameters.items():
-        for key, value in optimizer.state.get(parameter, {}).items():
-            if isinstance(value, torch.Tensor):
-                tensors[f"{prefix}{name}.{key}"] = value
-            else:
-                values[f"{name}.{key}"] = value
-    return tensors, None if _is_adam(optimizer) else {"kind": type(optimizer).__name__, "values": values}
-
-
-def restore_optimizer(
-    optimizer: torch.optim.Optimizer,
-    parameters: Mapping[str, torch.nn.Parameter],
-    tensors: Mapping[str, torch.Tensor],
-    record: dict[str, Any] | None,
-) -> None:
-    """Put back what `gather_optimizer` returned, into a fresh optimizer of the same kind; ValueError for another."""
-    adam = _is_adam(optimizer)
-    kind, expected = "Adam" if record is None else record["kind"], "Adam" if adam else type(optimizer).__name__
-    if kind != expected:
-        raise ValueError(f"its optimizer is {kind}, expected {expected}")
-    groups = {id(x): group for group in optimizer.param_groups for x in group["params"]}
-    for name, parameter in parameters.items():
-        prefix = f"{'adam' if adam else 'optimizer'}.{name}."
-        keys = ADAM_STATE if adam else [key.removeprefix(prefix) for key in tensors if key.startswith(prefix)]
-        values: dict[str, Any] = _part(tensors, prefix, keys)
-        for key, value in values.items():
-            if adam and value.shape != (() if key == "step" else parameter.shape):
-                raise ValueError(f"{prefix}{key}: expected the shape of its parameter, {tuple(parameter.shape)}")
-            group = groups[id(parameter)]
-            if key != "step" or group.get("fused") or group.get("capturable"):  # else torch keeps it on the CPU
-                values[key] = value.to(parameter.device)
-        if record is not None:
-            values |= {
-                key.removeprefix(f"{name}."): x for key, x in record["values"].items() if key.startswith(f"{name}.")
-            }
-        if values:
-            optimizer.state[parameter] = values
-
-
 @contextmanager
 def checkpoint_errors(run: Path | str) -> Iterator[None]:
     """Turn whatever a snapshot that does not fit raises into one CheckpointError."""
@@ -255,6 +213,10 @@ def check_origin(origin: Mapping[str, str], config: Config, state: Mapping[str, 
     With `extend`, the run may have had fewer iterations.
     """
     refuse_removed(state["config"])
+    if "optimizer" in state:
+        raise ValueError("it was trained by an optimizer of your own, which this version does not support")
+    if state.get("rate_factor", 1.0) != 1.0:
+        raise ValueError("it went on at lowered rates after a divergence, which this version does not support")
     # Neither CUDA graphs nor how many teachers the run would train first changes what a trainer does.
     saved = config_from_dict(state["config"])
     saved = dataclasses.replace(saved, cuda_graphs=config.cuda_graphs, teachers=config.teachers)

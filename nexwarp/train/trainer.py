@@ -13,7 +13,7 @@ from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene
 from nexwarp.errors import OutOfMemoryError, SceneError
 from nexwarp.machine import deterministic, needed_memory, seed_everything, torch_threads
-from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, can_capture, graph_key, updating
+from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, graph_key, updating
 from nexwarp.model.model import Model
 from nexwarp.model.render import draw
 from nexwarp.train.checkpoint import Snapshot, load_checkpoint, save_checkpoint
@@ -21,7 +21,7 @@ from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.finish import FinishObserver, finish_model
 from nexwarp.train.initial import Start, check_start
 from nexwarp.train.losses import OwnLoss, as_taken, check_own_losses, step_losses
-from nexwarp.train.optimizer import OptimizerMaker, set_rates
+from nexwarp.train.optimizer import set_rates
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport, check_health, oom_message
 from nexwarp.train.state import TrainingState, check_origin, check_snapshot, checkpoint_errors, scene_digest
@@ -47,7 +47,6 @@ class Trainer(TrainingState):
         device: torch.device | str,
         *,
         losses: Mapping[str, OwnLoss] | None = None,
-        optimizer: OptimizerMaker | None = None,
         teachers: Iterable[Model] = (),
         calibrate: Calibrate = calibrate_exposures,
         **start: Unpack[Start],
@@ -59,14 +58,13 @@ class Trainer(TrainingState):
             config: settings.
             device: where to train.
             losses: own losses by name, as for `nexwarp.train`.
-            optimizer: makes an optimizer of the parameter groups; None is Adam.
             teachers: trained models of the scene, to learn from their renderings too.
             calibrate: estimates the photos' exposures.
             start: `surfels`, `init` and `texture`, as for `nexwarp.train`.
 
         Raises:
             SceneError: the scene has no training views.
-            TypeError, ValueError: own losses, the optimizer, teachers or what to start from do not fit.
+            TypeError, ValueError: own losses, teachers or what to start from do not fit.
         """
         if not scene.train:
             raise SceneError(f"{scene.path}: expected at least one training view, got none")
@@ -75,10 +73,9 @@ class Trainer(TrainingState):
         check_start(scene, config, start)
         seed_everything(config.seed)
         calibration = calibrate(scene, config)
-        super().__init__(scene, config, device, None if calibration is None else calibration.colors, optimizer, start)
+        super().__init__(scene, config, device, None if calibration is None else calibration.colors, start)
         self.exposures = None if calibration is None else calibration.exposures
-        capture = config.cuda_graphs and device.type == "cuda" and can_capture(self.optimizer)
-        self.graphs = StepGraphs(device) if capture else None
+        self.graphs = StepGraphs(device) if config.cuda_graphs and device.type == "cuda" else None
         self.targets = (
             TaughtTargets(self, calibration, models, partial(beside, self.graphs))
             if models
@@ -247,7 +244,7 @@ class Trainer(TrainingState):
 
         Raises:
             MissingError: there is none.
-            CheckpointError: they are damaged, or scene, settings, optimizer or teachers differ.
+            CheckpointError: they are damaged, or scene, settings or teachers differ.
         """
         snapshot = self._read(Path(run), warn)
         with checkpoint_errors(run):

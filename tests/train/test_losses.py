@@ -49,14 +49,9 @@ def test_dssim_of_constant_images_by_hand() -> None:
     assert one.item() == pytest.approx(1 - top / ((g * g * (a * a + b * b) + 1e-4) * (variances + 9e-4)), abs=1e-13)
 
 
-def test_alpha_and_grid_by_hand() -> None:
+def test_alpha_by_hand() -> None:
     weights = torch.tensor([[[0.5, 0.25], [0.0, 0.0]]])
     assert alpha_loss(weights).item() == (0.25 + 1.0) / 2
-    random = torch.randn(3, 4, 2, dtype=torch.float64, requires_grad=True)
-    resolutions = torch.tensor([0.9, 1.4, 2.0], dtype=torch.float64)
-    assert gradcheck(lambda h: losses.grid_loss(h, resolutions), random)
-    grid = torch.tensor([[[1.0, -2.0]], [[3.0, 0.0]]])
-    assert losses.grid_loss(grid, torch.tensor([1.0, 2.0])).item() == pytest.approx(5.0 + 9.0 / 8.0, rel=1e-6)
 
 
 def arguments(slots: int = 2) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Training from Python: the bits of the command line, own losses and optimizers, callbacks, scenes in memory."""
+"""Training from Python: the bits of the command line, own losses, callbacks, scenes in memory."""
 
 import dataclasses
 from collections.abc import Callable
@@ -11,8 +11,6 @@ import torch
 
 import nexwarp as nw
 from nexwarp.data import Scene
-from nexwarp.errors import CheckpointError
-from nexwarp.train.optimizer import OptimizerMaker, ParameterGroup
 from nexwarp.train.recipe import DensifyConfig
 from tests.trainer_support import small
 
@@ -85,76 +83,8 @@ def test_losses_that_do_not_fit_are_named(
         run(scene, 1, losses=losses)
 
 
-def radam(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
-    return torch.optim.RAdam(groups, eps=1e-15)
-
-
-def sgd(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
-    return torch.optim.SGD([group | {"lr": 2 * group["lr"]} for group in groups], lr=0.0, momentum=0.9)
-
-
-@pytest.mark.parametrize("make", [radam, sgd])
-def test_any_optimizer_follows_densification_and_resumes(scene: Scene, tmp_path: Path, make: OptimizerMaker) -> None:
-    straight = run(scene, optimizer=make)
-    assert len(straight.surfels) > 60
-    for name, parameter in straight._named_parameters():
-        assert torch.isfinite(parameter).all(), name
-        state = straight.optimizer.state[parameter]
-        rows = [x for x in state.values() if isinstance(x, torch.Tensor) and x.ndim]
-        assert rows and all(x.shape == parameter.shape for x in rows), name
-    first = run(scene, 23, optimizer=make)
-    first.save(tmp_path)
-    second = nw.Trainer(scene, SMALL, "cpu", optimizer=make)
-    second.restore(tmp_path)
-    second.run()
-    for (name, value), (_, other) in zip(straight._named_parameters(), second._named_parameters(), strict=True):
-        assert torch.equal(value, other), name
-        for key, x in straight.optimizer.state[value].items():
-            assert torch.equal(torch.as_tensor(x), torch.as_tensor(second.optimizer.state[other][key])), (name, key)
-    with pytest.raises(CheckpointError, match="expected Adam"):
-        nw.Trainer(scene, SMALL, "cpu").restore(tmp_path)
-
-
-def test_schedules_drive_the_rates_of_any_optimizer(scene: Scene) -> None:
-    """From the first rate to the last one; a changed first rate scales both."""
-    trainer, rates = nw.Trainer(scene, SMALL, "cpu", optimizer=sgd), SMALL.rates
-    found = []
-
-    def note(_: nw.StepReport) -> None:
-        found.append({group["name"]: group["lr"] for group in trainer.optimizer.param_groups})
-
-    trainer.run(note)
-    for index, end in ((0, found[0]), (1, found[-1])):
-        assert end["means"] == pytest.approx(2 * rates.means[index] * scene.scale)
-        assert end["grid"] == pytest.approx(2 * rates.grid[index])
-        assert end["raw_quats"] == pytest.approx(2 * rates.quats)
-
-
-@pytest.mark.parametrize(
-    ("make", "error", "match"),
-    [
-        (lambda groups: 3, TypeError, "optimizer: expected it to return a torch.optim.Optimizer, got int"),
-        (lambda groups: torch.optim.SGD(groups[:3], lr=0.1), ValueError, "to keep the parameter groups means, .*, mlp"),
-        (lambda groups: torch.optim.SGD([g["params"][0] for g in groups], lr=0.1), ValueError, "got None"),
-    ],
-)
-def test_optimizers_that_do_not_fit_are_refused(
-    scene: Scene, make: Callable[..., Any], error: type[Exception], match: str
-) -> None:
-    with pytest.raises(error, match=match):
-        nw.Trainer(scene, SMALL, "cpu", optimizer=make)
-
-
-def capturable(groups: list[ParameterGroup]) -> torch.optim.Optimizer:
-    on_gpu = [group | {"lr": torch.tensor(group["lr"], device="cuda")} for group in groups]
-    return torch.optim.AdamW(on_gpu, capturable=True)
-
-
 @pytest.mark.cuda
-@pytest.mark.parametrize(("make", "captured"), [(None, True), (capturable, True), (radam, False)])
-def test_own_losses_and_optimizers_are_captured_where_they_can_be(
-    scene: Scene, make: OptimizerMaker | None, captured: bool
-) -> None:
+def test_own_losses_are_captured(scene: Scene) -> None:
     """Replayed steps have the bits of launched ones."""
 
     def loss(rendering: nw.Rendering, target: nw.Target) -> torch.Tensor:
@@ -170,10 +100,10 @@ def test_own_losses_and_optimizers_are_captured_where_they_can_be(
 
     for graphs in (False, True):
         config = dataclasses.replace(SMALL, iterations=120, deterministic=True, cuda_graphs=graphs)
-        trainer = nw.Trainer(scene, config, "cuda", losses={"own": loss}, optimizer=make)
+        trainer = nw.Trainer(scene, config, "cuda", losses={"own": loss})
         trainer.run(observe)
         runs.append(trainer)
-    assert (runs[1].graphs is not None) == captured == any(replayed)
+    assert any(replayed)
     for (name, value), (_, other) in zip(runs[0]._named_parameters(), runs[1]._named_parameters(), strict=True):
         assert torch.equal(value, other), name
 
