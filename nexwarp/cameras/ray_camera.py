@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 
 from nexwarp.cameras.camera import LARGEST_DISTANCE, Camera
@@ -12,8 +13,7 @@ from nexwarp.errors import check_finite, check_range, check_tensors
 
 MAX_SIDE = 32768  # pixels
 MAX_PARAMETER = 1e3  # of a fisheye lens
-BISECTIONS = 60
-INVERSE_ERROR = 1e-6  # radius, relative to the focal length, by which the inverse of a lens may miss
+SAMPLES = 2**16 + 1  # of a lens, between which its inverse is linear: it misses by less than 1e-9 of a radius
 
 
 @dataclass(frozen=True)
@@ -160,18 +160,9 @@ def _angle_of(radius: torch.Tensor, terms: Sequence[float], largest: float) -> t
 
     The lens is inverted where its radius grows, from the optical axis on.
     """
-    powers = [1.0, *terms]
-
-    def radius_at(t: torch.Tensor) -> torch.Tensor:
-        return sum((k * t ** (2 * i + 1) for i, k in enumerate(powers)), torch.zeros_like(t))
-
-    samples = torch.linspace(0.0, largest, 4097, dtype=torch.float64)
-    falling = (radius_at(samples).diff() <= 0).nonzero()
-    end = samples[int(falling[0])] if len(falling) else samples[-1]
-    low, high = torch.zeros_like(radius), end.expand_as(radius).clone()
-    for _ in range(BISECTIONS):  # bisection: it cannot leave the growing part
-        middle = 0.5 * (low + high)
-        above = radius_at(middle) > radius
-        low, high = torch.where(above, low, middle), torch.where(above, middle, high)
-    angle = 0.5 * (low + high)
-    return angle, (radius_at(angle) - radius).abs() < INVERSE_ERROR
+    angles = np.linspace(0.0, largest, SAMPLES)
+    radii = np.polyval([*terms[::-1], 1.0], angles**2) * angles
+    falling = np.flatnonzero(np.diff(radii) <= 0)
+    end = int(falling[0]) + 1 if len(falling) else SAMPLES
+    angle = np.interp(radius.numpy(), radii[:end], angles[:end])
+    return torch.from_numpy(angle), radius <= radii[end - 1]
