@@ -116,6 +116,8 @@ def _check_numbers(path: Path, image: "PIL.Image.Image") -> None:
     if image.mode == "F" or (image.mode == "I" and tags) or any(kind != UNSIGNED for kind in formats):
         numbers = "floats" if image.mode == "F" else "signed or 32-bit integers"
         raise FormatError(f"{path}: expected 8 or 16 bits a channel, got {numbers}, whose range is unknown; convert it")
+    if image.mode.startswith("I;16") and (tags.get(BITS, (16,))[0] != 16 or tags.get(PHOTOMETRIC) == WHITE_IS_ZERO):
+        raise FormatError(f"{path}: expected 8 or 16 bits a channel with 0 as black, got another TIFF file; convert it")
 
 
 def image_size(path: Path) -> tuple[int, int]:
@@ -157,18 +159,7 @@ def _loaded(path: Path, upright: bool = False) -> Iterator["PIL.Image.Image"]:
         image.load()
         if turned:
             ImageOps.exif_transpose(image, in_place=True)
-        tags = getattr(image, "tag_v2", {})
-        yield _full_range(image, tags.get(BITS, (16,))[0], tags.get(PHOTOMETRIC) == WHITE_IS_ZERO)
-
-
-def _full_range(image: "PIL.Image.Image", bits: int, inverted: bool) -> "PIL.Image.Image":
-    """Return 16-bit grey with black as 0 and white as 65535; PIL leaves 12 bits and inverted values of TIFF files."""
-    if not image.mode.startswith("I;16") or (bits == 16 and not inverted):
-        return image
-    from PIL import Image
-
-    values = np.asarray(image).astype(np.int64) * 65535 // (2**bits - 1)
-    return Image.fromarray((65535 - values if inverted else values).astype(np.uint16))
+        yield image
 
 
 def read_image(path: Path, white: float | None = None) -> torch.Tensor:

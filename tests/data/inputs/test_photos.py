@@ -60,17 +60,6 @@ def tiff(file, photo, dtype="<u1", scale=1.0, photometric=2, more=None):
     tifffile.imwrite(file, values, byteorder=">" if dtype[0] == ">" else "<", photometric=photometric, **options)
 
 
-def tiff12(file, photo):
-    """12 bits a pixel, two pixels in three bytes."""
-    values = np.round(grey(photo)[..., 0] * (4095 / 255)).astype(int)
-    one, two = values[:, ::2], values[:, 1::2]
-    packed = np.stack([one >> 4, ((one & 15) << 4) | (two >> 8), two & 255], axis=-1).astype(np.uint8)
-    tifffile.imwrite(file, packed.reshape(len(packed), -1))
-    with tifffile.TiffFile(file, mode="r+") as written:
-        written.pages[0].tags["ImageWidth"].overwrite(room.WIDTH)
-        written.pages[0].tags["BitsPerSample"].overwrite(12)
-
-
 def pgm(file, photo, largest):
     values = np.round(grey(photo)[..., 0] * (largest / 255)).astype(">u2")
     file.write_bytes(f"P5 {room.WIDTH} {room.HEIGHT} {largest}\n".encode() + values.tobytes())
@@ -141,11 +130,10 @@ KINDS: dict[str, tuple[str, Callable[..., None], Any]] = {
     "tif of LA": ("tif", partial(transparent, mode="LA"), grey),
     "tif of premultiplied LA": ("tif", partial(tiff, photometric=1, more=(1, 255)), grey),
     "tif of white as 0": ("tif", partial(tiff, photometric=0), grey),
-    "tif of 12 bits": ("tif", tiff12, grey),
     "tif of 16 bits": ("tif", partial(tiff, dtype="<u2", scale=257), same),
     "tif of 16 bits, big-endian": ("tif", partial(tiff, dtype=">u2", scale=257), same),
     "tif of 16-bit grey": ("tif", partial(tiff, dtype="<u2", scale=257, photometric=1), grey),
-    "tif of 16-bit grey, white as 0": ("tif", partial(tiff, dtype="<u2", scale=257, photometric=0), grey),
+    "tif of 16-bit grey, white as 0": ("tif", partial(tiff, dtype="<u2", scale=257, photometric=0), "0 as black"),
     "tif of 16-bit RGBA": ("tif", partial(tiff, dtype="<u2", scale=257, more=(2, 30_000)), same),
     "tif of grey floats": ("tif", partial(tiff, dtype="<f4", scale=1 / 255, photometric=1), FLOATS),
     "tif of floats": ("tif", partial(tiff, dtype="<f4", scale=1 / 255), UNKNOWN),
