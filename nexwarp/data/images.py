@@ -256,13 +256,12 @@ def _mask_values(image: "PIL.Image.Image") -> np.ndarray:
         return np.array(image)
     if image.mode != "P":
         return np.array(_on_black(image).convert("L"))
-    indices = np.array(image)
-    every = image.resize((256, 1))
-    every.putdata(range(256))
-    colors = np.array(_on_black(every).convert("RGB"))[0]
-    used = np.unique(colors[np.bincount(indices.ravel(), minlength=256) > 0], axis=0)
-    black_and_another = len(used) == 2 and not used[0].any()
-    return colors.max(axis=1)[indices] if black_and_another or (used == used[:, :1]).all() else indices
+    shown = _on_black(image).convert("RGB")
+    used = np.array([color for _, color in shown.getcolors(256) or []])
+    black_and_another = len(used) == 2 and not used.any(axis=1).all()
+    if black_and_another or (used == used[:, :1]).all():
+        return np.array(shown).max(axis=2)
+    return np.array(image)
 
 
 def _on_black(image: "PIL.Image.Image") -> "PIL.Image.Image":

@@ -208,10 +208,13 @@ def _find(where: str, folder: Path, named: str, images: str) -> Path | None:
 
 def _split(frames: _Frames) -> tuple[list[Photo], frozenset[str] | None]:
     """Return the photos in use and the names of the test photos; None if the file has no split."""
-    known = {plain_name(photo.name) for photo in frames.photos} | {
-        plain_name(_view_name(name)) for name in frames.missing
-    }
-    known |= {str(PurePosixPath(name).with_suffix("")) for name in known}
+
+    def forms(name: str) -> set[str]:
+        plain = plain_name(_view_name(name))
+        return {plain, str(PurePosixPath(plain).with_suffix(""))}
+
+    names_of = {photo.name: forms(photo.name) for photo in frames.photos}
+    known = set[str]().union(*names_of.values(), *map(forms, frames.missing))
     lists: dict[str, set[str]] = {}
     for key in ("train_filenames", "val_filenames", "test_filenames"):
         names = frames.data.get(key)
@@ -226,27 +229,17 @@ def _split(frames: _Frames) -> tuple[list[Photo], frozenset[str] | None]:
             raise ValueError(f"{frames.file}: {key}: expected photos of the frames, got {unknown[0]}")
     if not lists:
         return frames.photos, frozenset(frames.held_out) or None
-
-    def listed(names: set[str]) -> list[Photo]:
-        plain = [(photo, plain_name(photo.name)) for photo in frames.photos]
-        return [photo for photo, name in plain if name in names or str(PurePosixPath(name).with_suffix("")) in names]
-
-    test = listed(lists.get("test_filenames") or lists.get("val_filenames") or set())
-    tests = frozenset(photo.name for photo in test) | frames.held_out
-    test = [photo for photo in frames.photos if photo.name in tests]
-    candidates = listed(lists["train_filenames"]) if "train_filenames" in lists else frames.photos
-    train = [photo for photo in candidates if photo.name not in tests]
-    both = len(candidates) - len(train)
-    if both and "train_filenames" in lists:
-        warnings.warn(
-            f"{frames.file}: {both} photos are listed for training and testing; they are used for testing only",
-            stacklevel=2,
-        )
-    if not train:
+    held_out = lists.get("test_filenames") or lists.get("val_filenames") or set()
+    tests = frozenset(name for name, forms in names_of.items() if forms & held_out) | frames.held_out
+    train = {name for name, forms in names_of.items() if forms & lists.get("train_filenames", forms)}
+    if train & tests and "train_filenames" in lists:
+        both = f"{len(train & tests)} photos are listed for training and testing; they are used for testing only"
+        warnings.warn(f"{frames.file}: {both}", stacklevel=2)
+    if not train - tests:
         raise ValueError(
             f"{frames.file}: train_filenames: expected at least one photo that is not for testing, got none"
         )
-    return sorted(train + test, key=lambda photo: photo.name), tests
+    return [photo for photo in frames.photos if photo.name in train | tests], tests
 
 
 def _points(frames: _Frames, beside: str | None = None) -> Cloud | None:

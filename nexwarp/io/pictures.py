@@ -96,48 +96,34 @@ def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dic
 
     FileNotFoundError: no such file. FormatError: it is not OpenEXR, damaged, or has other channels than `save_exr` has.
     """
-    import OpenEXR
-
     path = Path(path)
     if not path.is_file():
         raise MissingError(f"{path}: no such file, expected an OpenEXR file")
-    tensors: dict[str, torch.Tensor] = {}
+    parts = _parts(path)
     try:
-        _check_size(path)
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            text = str(file.parts[0].header[METADATA])
-            for part in file.parts:
-                tensors[part.name()] = _tensor({name: x.pixels for name, x in part.channels.items()})
-        metadata = dict(parse_json("metadata", text.encode("utf-8", "replace")))
+        tensors = {name: _tensor(channels) for name, _, channels in parts}
+        metadata = dict(parse_json("metadata", str(parts[0][1][METADATA]).encode("utf-8", "replace")))
         # OpenEXR prints a message and omits the parts that it cannot read.
         if list(metadata["parts"]) != list(tensors):
             raise ValueError("parts of it cannot be read")
-    except Exception as error:  # OpenEXR raises RuntimeError and other types
-        raise FormatError(
-            f"{path}: expected a whole OpenEXR file of nexwarp, but it cannot be read ({one_line(error)})"
-        ) from None
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise _damaged(path, error) from None
     return tensors, metadata
 
 
 def load_exr_channel(path: Path) -> np.ndarray:
     """Read the only channel (H, W) of an OpenEXR file as float32; FormatError if it has more, or is damaged."""
-    planes = _channels(path)
+    planes = [plane for _, _, channels in _parts(path) for plane in channels.values()]
     if len(planes) != 1:
         raise FormatError(f"{path}: expected one channel, got {len(planes)}")
-    return np.asarray(planes[0][1], np.float32)
-
-
-def exr_size(path: Path) -> tuple[int, int]:
-    """Return width and height of an OpenEXR file's first part, from its header; FormatError if it is damaged."""
-    try:
-        return _check_size(path)
-    except Exception as error:  # OpenEXR raises RuntimeError and other types
-        raise _damaged(path, error) from None
+    return np.asarray(planes[0], np.float32)
 
 
 def load_exr_colors(path: Path) -> np.ndarray:
     """Read the channels R, G, B of an OpenEXR file's first part as (H, W, 3) float32; FormatError without them."""
-    planes = dict(reversed(_channels(path)))  # of a name that parts share, the first
+    planes: dict[str, np.ndarray] = {}
+    for _, _, channels in reversed(_parts(path)):  # of a name that parts share, the first
+        planes |= channels
     if not planes.keys() >= {*"RGB"}:
         raise FormatError(f"{path}: expected the channels R, G and B, got {', '.join(planes)}")
     colors = np.stack([np.asarray(planes[name], np.float32) for name in "RGB"], axis=-1)
@@ -146,14 +132,17 @@ def load_exr_colors(path: Path) -> np.ndarray:
     return colors
 
 
-def _channels(path: Path) -> list[tuple[str, np.ndarray]]:
-    """Read the names and the pixels (H, W) of all channels of an OpenEXR file."""
+def _parts(path: Path) -> list[tuple[str, dict[str, Any], dict[str, np.ndarray]]]:
+    """Read the name, the header, and the channels (H, W) by name of each part of an OpenEXR file."""
     import OpenEXR
 
+    exr_size(path)
     try:
-        _check_size(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            return [(name, channel.pixels) for part in file.parts for name, channel in part.channels.items()]
+            return [
+                (part.name(), dict(part.header), {name: channel.pixels for name, channel in part.channels.items()})
+                for part in file.parts
+            ]
     except Exception as error:  # OpenEXR raises RuntimeError and other types
         raise _damaged(path, error) from None
 
@@ -199,23 +188,29 @@ def _tensor(channels: Mapping[str, np.ndarray]) -> torch.Tensor:
     return torch.from_numpy(np.stack(planes, axis=-1) if len(planes) == 3 else planes[0])
 
 
-def _check_size(path: Path) -> tuple[int, int]:
-    """Return width and height of the first part; ValueError if the headers announce more than a file can hold."""
+def exr_size(path: Path) -> tuple[int, int]:
+    """Return width and height of an OpenEXR file's first part, from its header.
+
+    FormatError: the file is damaged, or its headers announce more than it can hold.
+    """
     import OpenEXR
 
     total, sizes = 0, []
-    with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
-        for part in file.parts:
-            low, high = part.header["dataWindow"]
-            width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
-            if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-                raise ValueError(f"expected 1 to {MAX_SIDE} pixels a side, got {width}x{height}")
-            sizes.append((width, height))
-            total += width * height * 4 * len(part.header["channels"])
-    limit = MAX_RATIO * path.stat().st_size
-    if total > limit:
-        raise ValueError(f"expected at most {limit:,} bytes of pixels from a file of this size, got {total:,}")
-    return sizes[0]
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            for part in file.parts:
+                low, high = part.header["dataWindow"]
+                width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+                if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+                    raise ValueError(f"expected 1 to {MAX_SIDE} pixels a side, got {width}x{height}")
+                sizes.append((width, height))
+                total += width * height * 4 * len(part.header["channels"])
+        limit = MAX_RATIO * path.stat().st_size
+        if total > limit:
+            raise ValueError(f"expected at most {limit:,} bytes of pixels from a file of this size, got {total:,}")
+        return sizes[0]
+    except Exception as error:  # OpenEXR raises RuntimeError and other types
+        raise _damaged(path, error) from None
 
 
 def error_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:

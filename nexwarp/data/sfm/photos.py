@@ -125,21 +125,27 @@ def affordable_threads(folder: Path, names: Sequence[str], options: SfmOptions) 
 
 
 def read_each(
-    folder: Path, names: Sequence[str], read: Callable[[str], T], strict: bool
+    folder: Path,
+    names: Sequence[str],
+    read: Callable[[str], T],
+    strict: bool,
+    done: Callable[[int], None] = lambda count: None,
 ) -> tuple[dict[str, T], dict[str, str]]:
     """Return what `read` gives for each photo, and the reasons of those for which it raises ValueError.
 
-    ValueError: fewer than 3 photos are left, or, if `strict`, one cannot be read.
+    `done` is called with the number of photos that were read or skipped. ValueError: fewer than 3 photos are left, or,
+    if `strict`, one cannot be read.
     """
     results: dict[str, T] = {}
     skipped: dict[str, str] = {}
-    for name in names:
+    for count, name in enumerate(names, start=1):
         try:
             results[name] = read(name)
         except ValueError as error:
             if strict or isinstance(error.__cause__, MemoryError):
                 raise
             skipped[name] = str(error).removeprefix(f"{folder / name}: ")
+        done(count)
     if skipped and len(results) < MIN_PHOTOS:
         name, reason = next(iter(skipped.items()))
         raise ValueError(
@@ -169,17 +175,8 @@ def read_photos(
     """
     with ThreadPoolExecutor(threads) as pool:  # decoding releases the GIL
         jobs = {name: pool.submit(_read_photo, folder, name, prepared) for name in names}
-        count = 0
-
-        def result(name: str) -> InputPhoto:
-            nonlocal count
-            count += 1
-            photo = jobs[name].result()
-            done(count)
-            return photo
-
         try:
-            photos, skipped = read_each(folder, names, result, strict)
+            photos, skipped = read_each(folder, names, lambda name: jobs[name].result(), strict, done)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
