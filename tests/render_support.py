@@ -159,9 +159,8 @@ def assert_gradients(actual: torch.nn.Module, expected: torch.nn.Module, row: to
     """Fail unless all parameters have the same gradients; one that is missing counts as zero."""
     parameters = dict(actual.named_parameters())
     for name, parameter in expected.named_parameters():
-        gradients = [
-            torch.zeros_like(value) if value.grad is None else value.grad for value in (parameters[name], parameter)
-        ]
+        pair = parameters[name], parameter
+        gradients = [torch.zeros_like(value) if value.grad is None else value.grad for value in pair]
         assert_close(*gradients, kind="gradient", name=name, precision=row)
 
 

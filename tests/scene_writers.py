@@ -74,9 +74,8 @@ def photograph(photo: np.ndarray, pinhole: Lens, lens: Lens, samples: int = 3) -
     x, y = ((np.arange(side * samples) + 0.5) / samples for side in (lens.width, lens.height))
     pixels = np.stack(np.meshgrid(x, y), axis=-1)
     column, row = pinhole.project(lens.unproject(pixels.reshape(-1, 2))).T - 0.5
-    planes = [
-        map_coordinates(photo[..., c].astype(np.float64), (row, column), order=1, mode="nearest") for c in range(3)
-    ]
+    channels = np.moveaxis(photo.astype(np.float64), -1, 0)
+    planes = [map_coordinates(channel, (row, column), order=1, mode="nearest") for channel in channels]
     fine = np.stack(planes, axis=-1).reshape(lens.height, samples, lens.width, samples, 3)
     return np.floor(fine.mean(axis=(1, 3)) + 0.5).astype(np.uint8)
 

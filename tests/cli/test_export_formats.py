@@ -58,11 +58,8 @@ def test_a_finished_run_becomes_gltf_usd_and_spz(finished, monkeypatch, capsys):
     refused(capsys, ["export", str(finished), "--format", "glb", "--device", "cpu"], "scene.glb", "opacity above 0.3")
     assert not (finished / "export").exists()
     monkeypatch.setattr("nexwarp.export.glb.CUTOFF", 0.05)  # surfels of a short training are faint
-    for package, kind, name in (
-        ("trimesh", "glb", "scene.glb"),
-        ("gaussforge", "spz", "splats.spz"),
-        ("pxr", "usd", "scene.usdz"),
-    ):
+    packages = {"trimesh": ("glb", "scene.glb"), "gaussforge": ("spz", "splats.spz"), "pxr": ("usd", "scene.usdz")}
+    for package, (kind, name) in packages.items():
         pytest.importorskip(package)
         assert cli.main(["export", str(finished), "--format", kind, "--device", "cpu"]) == 0
         assert (finished / "export" / name).stat().st_size > 100

@@ -35,18 +35,15 @@ def test_a_finished_run_goes_on(extended: Path, scene: Path) -> None:
     assert (extended / "model.safetensors").read_bytes() == before
 
 
-def test_it_is_said_and_an_interruption_changes_nothing(
-    extended: Path, trained: Path, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_is_said_and_an_interruption_changes_nothing(extended, trained, scene, tmp_path, capsys):
     """Interrupted before its first new checkpoint, an extended run is resumed without --iterations."""
     run = Path(shutil.copytree(trained, tmp_path / "run"))
     command = ["train", str(scene), "--run", str(run), "--device", "cpu", "--resume"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Trainer, "step", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
         assert cli.main([*command, "--iterations", "30"]) == 130
-    assert "extended from 20 to 30 iterations: from here on, learning rates" in capsys.readouterr().out.replace(
-        "\n", " "
-    )
+    told = capsys.readouterr().out.replace("\n", " ")
+    assert "extended from 20 to 30 iterations: from here on, learning rates" in told
     assert cli.main(command) == 0
     assert "extended" not in capsys.readouterr().out
     assert (run / "model.safetensors").read_bytes() == (extended / "model.safetensors").read_bytes()

@@ -30,9 +30,8 @@ def test_points_reproject_onto_their_colors(scene: Scene) -> None:
         size = torch.tensor([view.camera.width, view.camera.height])
         inside = (pixels > 1).all(dim=1) & (pixels < size - 1).all(dim=1) & (depths > view.camera.near)
         error = torch.full((len(scene.points),), float("nan"))
-        error[inside] = (
-            (bilinear(view.image.float(), pixels[inside] - 0.5) - scene.colors[inside].float()).abs().mean(dim=1)
-        )
+        shown = bilinear(view.image.float(), pixels[inside] - 0.5)
+        error[inside] = (shown - scene.colors[inside].float()).abs().mean(dim=1)
         errors.append(error)
     # A point is seen by a few of the views that have it in frame; in the best three of them it must match.
     best = torch.stack(errors).nan_to_num(nan=255.0).sort(dim=0).values[:3].amax(dim=0)

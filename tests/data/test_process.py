@@ -133,9 +133,8 @@ def test_bad_videos_are_one_line_and_leave_nothing(tmp_path: Path, capsys: pytes
     refused(capsys, ["process", str(broken), str(scene)], "broken.mp4: expected a video, could not decode it")
     refused(capsys, ["process", str(tmp_path / "no.mp4"), str(scene)], "no.mp4", "no such")
     # A training's settings are checked before the video is decoded.
-    refused(
-        capsys, ["train", str(broken), "--run", str(tmp_path / "run"), "--set", "typo=1"], "typo: expected a setting"
-    )
+    command = ["train", str(broken), "--run", str(tmp_path / "run"), "--set", "typo=1"]
+    refused(capsys, command, "typo: expected a setting")
     picture = texture()[20:140, :160]
     still = clip(tmp_path / "still.mp4", 10, lambda i, x: picture)
     refused(capsys, ["process", str(still), str(scene)], "expected a video of a moving camera, got 10 frames", "1 are")

@@ -73,9 +73,8 @@ def test_points_are_where_photos_show_the_sphere(scene: Scene) -> None:
     nearest = torch.cdist(points.means, points.means).fill_diagonal_(9e9).min(dim=1).values
     torch.testing.assert_close(2 * points.scales, nearest, rtol=0.3, atol=0)
     for point, color in list(zip(points.means, points.colors, strict=True))[::10]:
-        pixels = [
-            scene.train[view].image[row, column].double() / 255 for view, row, column in seen_pixels(scene, point)
-        ]
+        places = seen_pixels(scene, point)
+        pixels = [scene.train[view].image[row, column].double() / 255 for view, row, column in places]
         assert pixels, "no photo shows it"
         torch.testing.assert_close(color.double(), torch.stack(pixels).mean(0), rtol=0, atol=1e-6)
 
@@ -133,10 +132,8 @@ def test_masked_pixels_show_nothing(scene: Scene) -> None:
 @pytest.mark.parametrize(("skybox", "expected"), [(20, 20), (1000, 33)])
 def test_some_initial_surfels_face_the_scene_a_sixth_at_most(scene: Scene, skybox: int, expected: int) -> None:
     config = small(max_surfels=400, skybox=skybox)
-    surfels, without = (
-        initial_surfels(scene, c, torch.Generator().manual_seed(0))
-        for c in (config, dataclasses.replace(config, skybox=0))
-    )
+    configs = config, dataclasses.replace(config, skybox=0)
+    surfels, without = (initial_surfels(scene, c, torch.Generator().manual_seed(0)) for c in configs)
     sky = skybox_points(scene.train, scene.points, expected)
     count = len(sky.means)
     assert 0 < count < expected, "some are near points of the cloud"

@@ -29,11 +29,8 @@ ROOT = Path(__file__).parents[2]
 LOCKS = ("torch", "run", "dev")
 RUN_EXTRAS = ("viewer", "video", "tensorboard", "flip", "glb", "splats")
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
-PLATFORMS = (
-    {"sys_platform": "linux", "platform_machine": "x86_64"},
-    {"sys_platform": "win32"},
-    {"sys_platform": "darwin"},
-)
+LINUX = {"sys_platform": "linux", "platform_machine": "x86_64"}
+PLATFORMS = (LINUX, {"sys_platform": "win32"}, {"sys_platform": "darwin"})
 
 
 def script(name: str) -> Any:

@@ -145,13 +145,8 @@ def test_a_page_is_read_as_it_is_drawn(files, model, baked, cameras, tmp_path):
         if "/" not in name:
             (tmp_path / "page" / name).write_bytes(data)
     (tmp_path / "one.html").write_bytes(one_file(files))
-    places = [
-        tmp_path / "one.html",
-        tmp_path / "page",
-        tmp_path / "page" / "index.html",
-        tmp_path / "page" / BAKED_FILE,
-    ]
-    scenes = [nw.load_baked(place) for place in places]
+    places = ("one.html", "page", "page/index.html", f"page/{BAKED_FILE}")
+    scenes = [nw.load_baked(tmp_path / place) for place in places]
     for camera in cameras.values():
         images = [scene.render(camera) for scene in scenes]
         assert all(torch.equal(image, images[0]) for image in images)

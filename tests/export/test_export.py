@@ -56,9 +56,7 @@ PLACE = ["x", "y", "z", "nx", "ny", "nz", *numbered("f_dc", 3)]
 
 @pytest.mark.parametrize("sh_degree", [0, 2, 3])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_surfels_read_back_bit_for_bit(
-    tmp_path: Path, sh_degree: int, dtype: torch.dtype, device: torch.device
-) -> None:
+def test_surfels_read_back_bit_for_bit(tmp_path, sh_degree, dtype, device):
     scene = random_scene(sh_degree=sh_degree, dtype=dtype, device=device)
     surfels = make_surfels(scene)
     with torch.no_grad():
@@ -125,12 +123,8 @@ def test_gltf_holds_the_gaussians_of_the_ply(tmp_path: Path, degree: int) -> Non
         accessor = tree["accessors"][number]
         view = tree["bufferViews"][accessor["bufferView"]]
         assert accessor["componentType"] == 5126 and view["byteOffset"] % 4 == 0
-        values = torch.frombuffer(
-            bytearray(content),
-            dtype=torch.float32,
-            offset=start + 8 + view["byteOffset"],
-            count=view["byteLength"] // 4,
-        )
+        offset, count = start + 8 + view["byteOffset"], view["byteLength"] // 4
+        values = torch.frombuffer(bytearray(content), dtype=torch.float32, offset=offset, count=count)
         found[name.removeprefix(f"{SPLATTING}:")] = values.view(accessor["count"], sizes[accessor["type"]])
     assert found["POSITION"].equal(stack(columns, "x", "y", "z"))
     corners = tree["accessors"][primitive["attributes"]["POSITION"]]
@@ -233,10 +227,8 @@ def cameras_around(device: torch.device) -> list[nw.Camera]:
     places = faces + [[x, y, z] for x in (-1.7, 1.7) for y in (-1.7, 1.7) for z in (-1.7, 1.7)]
     K = torch.tensor([[120.0, 0, 64], [0, 120, 64], [0, 0, 1]])
     up = torch.tensor([0.0, 0.0, 1.0])
-    return [
-        nw.Camera(look_at(torch.tensor(p, dtype=torch.float32), torch.zeros(3), up), K, 128, 128).to(device)
-        for p in places
-    ]
+    poses = [look_at(torch.tensor(place, dtype=torch.float32), torch.zeros(3), up) for place in places]
+    return [nw.Camera(pose, K, 128, 128).to(device) for pose in poses]
 
 
 def sphere_depths(camera: nw.Camera) -> torch.Tensor:

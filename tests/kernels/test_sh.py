@@ -49,9 +49,7 @@ def gradients(leaves: Leaves, degree: int) -> Leaves:
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize(("stored", "degree"), DEGREES)
-def test_plain_colors_agree_with_the_reference(
-    stored: int, degree: int, dtype: torch.dtype, device: torch.device
-) -> None:
+def test_plain_colors_agree_with_the_reference(stored, degree, dtype, device):
     leaves = make(300, stored, dtype, device)
     twins = [x.detach().double().cpu().requires_grad_() for x in leaves]
     colors = colors_of(leaves, degree)

@@ -92,9 +92,7 @@ def check_message(error: Exception, file: Path, name: str) -> None:
 
 @pytest.mark.parametrize("value", VALUES)
 @pytest.mark.parametrize("name", TENSORS)
-def test_a_number_is_refused_or_renders_finite(
-    stored: Path, tmp_path: Path, device: torch.device, name: str, value: float
-) -> None:
+def test_a_number_is_refused_or_renders_finite(stored, tmp_path, device, name, value):
     """On CUDA, the texture is computed in half precision."""
     file = tmp_path / "model.safetensors"
     file.write_bytes(with_number(stored.read_bytes(), name, value))
@@ -122,9 +120,7 @@ def test_the_bounds_are_those_of_every_tensor(stored: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(BOUNDS.keys() - {"exposures.falloff", "surfels.raw_quats"}))
 @pytest.mark.parametrize("end", [0, 1])
-def test_bounds_themselves_render_finite(
-    stored: Path, tmp_path: Path, device: torch.device, name: str, end: int
-) -> None:
+def test_bounds_themselves_render_finite(stored, tmp_path, device, name, end):
     """All elements at an end of the range at once, up to the float32 value next to it."""
     file = tmp_path / "model.safetensors"
     file.write_bytes(stored.read_bytes())
@@ -143,9 +139,7 @@ def test_bounds_themselves_render_finite(
         (dict.fromkeys(("texture.grid", *MATRICES), 1e4), "texture.mlp.2.weight: expected outputs of at most 1e+12"),
     ],
 )
-def test_numbers_that_fail_together_are_refused(
-    stored: Path, tmp_path: Path, change: dict[str, Any], message: str
-) -> None:
+def test_numbers_that_fail_together_are_refused(stored, tmp_path, change, message):
     file = tmp_path / "model.safetensors"
     file.write_bytes(stored.read_bytes())
 
@@ -161,9 +155,7 @@ def test_numbers_that_fail_together_are_refused(
 
 @pytest.mark.parametrize("value", VALUES)
 @pytest.mark.parametrize("key", ["background", "near", "scene_scale", "smooth_sh"])
-def test_a_number_of_the_metadata_is_refused_or_renders_finite(
-    stored: Path, tmp_path: Path, key: str, value: float
-) -> None:
+def test_a_number_of_the_metadata_is_refused_or_renders_finite(stored, tmp_path, key, value):
     file = tmp_path / "model.safetensors"
     file.write_bytes(stored.read_bytes())
     rewrite(file, lambda _, meta: meta.update({key: [0.1, value, 0.2] if key == "background" else value}))

@@ -30,9 +30,7 @@ def make(
 
 
 @pytest.mark.parametrize(("max_hits", "textured"), [(2, True), (2, False), (8, True), (0, False), (2, "residual")])
-def test_buffers_add_up_from_the_file_alone(
-    tmp_path: Path, device: torch.device, max_hits: int, textured: bool | str
-) -> None:
+def test_buffers_add_up_from_the_file_alone(tmp_path, device, max_hits, textured):
     save_buffers(tmp_path / "a.exr", make(max_hits=max_hits, textured=textured, device=device))
     b = load_buffers(tmp_path / "a.exr")
     behind = (1 - b.alpha)[..., None] * b.background

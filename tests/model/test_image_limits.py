@@ -32,11 +32,8 @@ def parts(device: torch.device | str = "cpu", **size: int) -> tuple[nw.Surfels, 
 def renderings(surfels: nw.Surfels, texture: nw.NeuralTexture | None, camera: nw.Camera, max_hits: int) -> list[Any]:
     """The calls that render, all of the same picture."""
     model = nw.Model(surfels, texture, options=nw.RenderOptions(max_hits=max_hits))
-    return [
-        lambda: nw.render(surfels, texture, camera, max_hits),
-        lambda: model.render(camera),
-        lambda: render_buffers(model, camera),
-    ]
+    alone = partial(nw.render, surfels, texture, camera, max_hits)
+    return [alone, partial(model.render, camera), partial(render_buffers, model, camera)]
 
 
 @pytest.fixture
@@ -123,9 +120,7 @@ def test_lists_that_memory_cannot_hold(monkeypatch):
     monkeypatch.setattr(memory, "SMALLEST_CHECKED", 100)
     monkeypatch.setattr(memory, "available_memory", lambda: 100)
     monkeypatch.setattr(ops, "check_image", lambda *_, **__: None)
-    with pytest.raises(
-        OutOfMemoryError, match=rf"a list of [\d,]+ \(tile, surfel\) entries needs at least .*{SMALLER}"
-    ):
+    with pytest.raises(OutOfMemoryError, match=rf"a list of [\d,]+ \(tile, surfel\) entries needs .*{SMALLER}"):
         nw.render(surfels, None, camera)
 
 

@@ -93,9 +93,7 @@ def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flag
 
 
 @pytest.mark.parametrize("falloff", [None, FALLOFF])
-def test_options_take_the_exposure_and_the_limits_away(
-    falloff: tuple[float, float, float] | None, device: torch.device
-) -> None:
+def test_options_take_the_exposure_and_the_limits_away(falloff, device):
     model, camera = full_model(device, falloff), cameras_of(device)[0]
     exposures, limits = model.exposures, model.detail_limits
     assert_same(model.render(camera), pure(model, camera, exposures=exposures, limits=limits))

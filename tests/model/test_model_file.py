@@ -57,15 +57,7 @@ def test_missing_model(tmp_path):
 def test_files_of_another_kind(tmp_path):
     file = save_model(tmp_path, make_model())
     whole = file.read_bytes()
-    for content in (
-        b"",
-        b"not a model at all",
-        b"\xff" * 64,
-        b"{}" * 100,
-        whole[:99],
-        whole[: len(whole) // 2],
-        whole[:-9],
-    ):
+    for content in (b"", b"no model", b"\xff" * 64, b"{}" * 100, whole[:99], whole[: len(whole) // 2], whole[:-9]):
         file.write_bytes(content)
         refused(ValueError, nw.load, tmp_path, names=file, match="expected a safetensors file")
     for metadata in (None, *({"nexwarp": header} for header in ("{", "[]", "3", '"text"'))):

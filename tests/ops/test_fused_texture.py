@@ -110,9 +110,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 @pytest.mark.cuda
 @pytest.mark.parametrize("size", CUDA_SIZES, ids=str)
 @pytest.mark.parametrize(("features", "degree", "clamp"), [(4, 3, False), (2, 2, True), (4, 1, True), (2, 0, False)])
-def test_fused_and_layered_agree(
-    features: int, degree: int, clamp: bool, size: tuple[int, int, int], counted: list[int]
-) -> None:
+def test_fused_and_layered_agree(features, degree, clamp, size, counted):
     case = make_case(torch.device("cuda"), features, degree, clamp, size, 2**16)
     exact = case.reference()
     references = list(torch.autograd.grad(exact, case.leaves, case.signal))

@@ -41,12 +41,7 @@ def test_scaling_the_world_scales_depths_only(device: torch.device) -> None:
     factor = 37.0
     viewmat = scene["viewmat"].clone()
     viewmat[:3, 3] *= factor
-    scaled = scene | {
-        "means": factor * scene["means"],
-        "scales": factor * scene["scales"],
-        "viewmat": viewmat,
-        "near": factor * scene["near"],
-    }
+    scaled = scene | {name: factor * scene[name] for name in ("means", "scales", "near")} | {"viewmat": viewmat}
     out, expected = draw(scaled), draw(scene)
     assert_alike(out, expected, ("image", "plain", "textured", "weights", "alpha"))
     assert_close(out.depths / factor, expected.depths, kind="value", name="depths")
@@ -163,9 +158,7 @@ def test_however_large_a_surfel_is_it_is_seen(scale: float, device: torch.device
 
 
 @pytest.mark.parametrize("mean", [(1e5, 0.0, 0.05), (0.0, 1e7, 0.02)])
-def test_a_huge_surfel_just_beyond_the_near_plane_is_seen(
-    mean: tuple[float, float, float], device: torch.device
-) -> None:
+def test_a_huge_surfel_just_beyond_the_near_plane_is_seen(mean, device):
     scene = in_a_row(device, [0.9], scale=1e10)
     out = draw(scene | {"means": torch.tensor([mean], device=device)})
     assert_close(out.alpha, torch.full((1, 1), 0.9), kind="value", name="alpha")

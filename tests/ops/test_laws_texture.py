@@ -34,9 +34,7 @@ def test_a_residual_texture_is_what_it_adds(device: torch.device) -> None:
 
 
 @pytest.mark.parametrize("jitter", [0.5, 3.0])
-def test_jitter_moves_lookups_along_their_rays(
-    jitter: float, device: torch.device, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_jitter_moves_lookups_along_their_rays(jitter, device, monkeypatch):
     """By a normal share of a pixel's size there, and nothing but what the texture says changes."""
     scene = random_scene(width=120, height=90, device=device)
     texture, colors = make_texture(device=device), nw.NeuralTexture.evaluate

@@ -30,11 +30,8 @@ def inputs(height: int = 7, width: int = 9, slots: int = 2) -> dict[str, torch.T
     target = torch.rand(height, width, 3, dtype=torch.float64)
     weights = 0.1 + 0.3 * torch.rand(height, width, slots, dtype=torch.float64)
     total = weights.sum(-1, keepdim=True)
-    given = {
-        "image": target + noise(height, width, 3),
-        "textured": (target + noise(height, width, 3)) * total,
-        "weights": weights,
-    }
+    image, textured = target + noise(height, width, 3), (target + noise(height, width, 3)) * total
+    given = {"image": image, "textured": textured, "weights": weights}
     return {name: x.requires_grad_() for name, x in given.items()} | {"target": target}
 
 
@@ -62,9 +59,7 @@ def moved(given: dict[str, torch.Tensor], device: torch.device, dtype: torch.dty
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("names", SUBSETS, ids="+".join)
 @pytest.mark.parametrize("size", [(7, 9, 1), (7, 9, 2), (7, 9, 5), (1, 1, 2), (1, 300, 2), (300, 1, 2)])
-def test_terms_are_the_references(
-    device: torch.device, size: tuple[int, int, int], names: tuple[str, ...], dtype: torch.dtype
-) -> None:
+def test_terms_are_the_references(device, size, names, dtype):
     factors = {name: FACTORS[name] for name in names}
     given = inputs(*size)
     expected = expected_terms(given, factors)

@@ -20,9 +20,7 @@ from tests.tolerances import assert_close
 )
 @pytest.mark.parametrize("clamp", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_textured_colors_agree_with_the_reference(
-    count: int, hits: int, degree: int, width: int, hidden_layers: int, clamp: bool, dtype: torch.dtype
-) -> None:
+def test_textured_colors_agree_with_the_reference(count, hits, degree, width, hidden_layers, clamp, dtype):
     """Numbers of points that no padding or part divides, and more points than a part has."""
     shape: dict[str, Any] = {"width": width, "hidden_layers": hidden_layers, "sh_degree": degree, "residual": True}
     texture = nw.NeuralTexture(5, 2**8, 1, 1.0, 6.0, **shape).to(dtype)
@@ -32,9 +30,8 @@ def test_textured_colors_agree_with_the_reference(
     directions = torch.nn.functional.normalize(draw(count, 3), dim=-1).to(dtype)
     depths = (1 + draw(count, hits).abs()).to(dtype)
     depths[3::7] = 0.0  # points to skip
-    leaves = [
-        x.detach().double().requires_grad_() for x in (positions, depths, texture.grid, *texture.mlp.parameters())
-    ]
+    inputs = (positions, depths, texture.grid, *texture.mlp.parameters())
+    leaves = [x.detach().double().requires_grad_() for x in inputs]
     there = depths > 0
     field = Texture(leaves[2], texture.resolutions.double(), leaves[3:])
     coefficients = reference_field(field, leaves[0][there], leaves[1][there], 24.0)

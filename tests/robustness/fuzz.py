@@ -39,14 +39,7 @@ MEMORY = 10**9  # bytes that the process may have beyond those before its first 
 BATCH = 2000  # inputs a process
 DOCUMENTED = (ValueError, TypeError, FileNotFoundError)
 M_ARENA_MAX = -8  # of glibc's mallopt: an arena a thread would count as 64 MB of address space
-NO_MEMORY = (
-    "MemoryError",
-    "can't allocate",
-    "bad_alloc",
-    "not enough memory",
-    "Unable to allocate",
-    "std::length_error",
-)
+NO_MEMORY = ("MemoryError", "can't allocate", "bad_alloc", "not enough memory", "Unable to allocate", "length_error")
 
 
 @dataclass(frozen=True)

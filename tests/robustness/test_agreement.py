@@ -39,15 +39,7 @@ CASES = [
 
 @pytest.mark.parametrize("row", [torch.float64, torch.float32, torch.float16])
 @pytest.mark.parametrize(("name", "textured", "max_hits", "sh_degree", "clamp_texture"), CASES)
-def test_render_agrees_with_the_reference(
-    name: str,
-    textured: bool | str,
-    max_hits: int,
-    sh_degree: int,
-    clamp_texture: bool,
-    row: torch.dtype,
-    device: torch.device,
-) -> None:
+def test_render_agrees_with_the_reference(name, textured, max_hits, sh_degree, clamp_texture, row, device):
     """Values, and gradients with respect to every parameter, to the feature grid, the MLP and the camera.
 
     The row float16 is float32 with the texture in half precision, the default on CUDA; its parameters are rounded

@@ -76,9 +76,8 @@ def _mumble(folder: Path) -> None:
 def test_failures_are_noticed_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read, kind: str) -> None:
     if kind == "hang":
         monkeypatch.setattr("tests.robustness.fuzz.HANG", 1.0)
-    result = Campaign(FuzzTarget("one", lambda _: [{"a": b"good"}], read, ("a",)), 3, tmp_path).run(
-        seconds=60.0, inputs=1
-    )
+    target = FuzzTarget("one", lambda _: [{"a": b"good"}], read, ("a",))
+    result = Campaign(target, 3, tmp_path).run(seconds=60.0, inputs=1)
     (failure,) = result.failures
     assert failure.kind == kind and result.inputs == 1 and not result.outcomes
     assert failure.folder == tmp_path / f"one-0-{kind}" and (failure.folder / "failure.txt").is_file()

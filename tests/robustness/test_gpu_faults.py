@@ -163,17 +163,15 @@ def test_a_fault_of_the_gpu_stops_training_and_the_last_checkpoint_is_resumed(ti
     with failing_gpu(None, "") as counted:
         assert train(tiny_folder, whole, device) == 0
     expected = (whole / "model.safetensors").read_bytes()
-    places = random.Random(1).sample(
-        range(len(counted.requests) // 10, len(counted.requests)), 12 if device.type == "cuda" else 3
-    )
+    requests = range(len(counted.requests) // 10, len(counted.requests))
+    places = random.Random(1).sample(requests, 12 if device.type == "cuda" else 3)
     for fatal, message in zip(sorted(places), FAULTS * 4, strict=False):
         run = tmp_path / f"run{fatal}"
         capsys.readouterr()
         with failing_gpu(fatal, message):
             assert train(tiny_folder, run, device) == 3
-        line = (
-            f"nexwarp: error: the GPU failed ({message.splitlines()[0]}); --resume continues from the last checkpoint\n"
-        )
+        first = message.splitlines()[0]
+        line = f"nexwarp: error: the GPU failed ({first}); --resume continues from the last checkpoint\n"
         assert capsys.readouterr().err == line
         assert not list(run.rglob("*.tmp*"))
         if (run / "model.safetensors").exists():  # a fault of the evaluation

@@ -123,9 +123,8 @@ def test_resuming_goes_on_as_if_nothing_had_happened(trainer, scene, tmp_path):
 )
 def test_damaged_lines_are_dropped(tmp_path, damage):
     path = tmp_path / LOG_FILE
-    path.write_bytes(
-        b'{"iteration": 1}\n' + damage + (b"" if damage.endswith(b"\n") else b"\n") + b'{"iteration": 3}\n'
-    )
+    end = b"" if damage.endswith(b"\n") else b"\n"
+    path.write_bytes(b'{"iteration": 1}\n' + damage + end + b'{"iteration": 3}\n')
     keep_lines(path, 3)
     assert [line["iteration"] for line in lines(tmp_path)] == [1, 3]
     keep_lines(path, 2)

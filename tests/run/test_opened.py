@@ -27,9 +27,7 @@ def model() -> nw.Model:
 
 
 @pytest.mark.parametrize("name", ["folder", "scene.safetensors"])
-def test_a_saved_model_opens_everywhere(
-    name: str, model: nw.Model, tiny_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_saved_model_opens_everywhere(name, model, tiny_folder, tmp_path, capsys):
     saved = tmp_path / name
     model.save(saved)
     results = tmp_path / "scene" if saved.suffix else saved

@@ -135,9 +135,8 @@ def test_a_path_from_a_file(run: Path, tmp_path: Path) -> None:
     folder = run / "renders" / "path_flight"
     assert files(folder) == {"0000.png", "0001.png"}
     near = load_cameras(run / "cameras.json")["train"]["b.png"].near
-    assert picture(folder / "0001.png").equal(
-        rendered(run, load_camera_path(tmp_path / "flight.json", near).cameras[1])
-    )
+    second = load_camera_path(tmp_path / "flight.json", near).cameras[1]
+    assert picture(folder / "0001.png").equal(rendered(run, second))
     assert command("export", run, "--format", "cameras") == 0
     assert command("render", run, "--path", run / "export" / "transforms.json") == 0
     camera = load_cameras(run / "cameras.json")["test"]["a.png"]
@@ -226,9 +225,8 @@ def test_exported_cameras_are_those_of_the_photos_files(tmp_path: Path, camera: 
     data = json.loads((folder / "transforms.json").read_text())
     assert data["camera_model"] == (model or "PINHOLE")
     if model is None:
-        assert all(
-            frame["file_path"].startswith("undistorted/") and frame["w"] < room.WIDTH for frame in data["frames"]
-        )
+        frames = data["frames"]
+        assert all(f["file_path"].startswith("undistorted/") and f["w"] < room.WIDTH for f in frames)
         return
     original = nw.load_scene(folder, format="colmap")
     read = nw.load_scene(folder, format="nerfstudio")

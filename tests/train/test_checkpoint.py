@@ -30,12 +30,8 @@ def kept(run: Path) -> list[int]:
 
 
 def test_checkpoint_round_trip(tmp_path):
-    tensors = {
-        "float": torch.randn(5, 0, 3),
-        "scalar": torch.tensor(7.0),
-        "bytes": torch.get_rng_state(),
-        "strided": torch.randn(4, 6).T,
-    }
+    tensors = {"float": torch.randn(5, 0, 3), "scalar": torch.tensor(7.0), "bytes": torch.get_rng_state()}
+    tensors["strided"] = torch.randn(4, 6).T
     state = {"iteration": 3, "order": [2, 0, 1], "python": [3, [1, 2], None], "seconds": 0.1}
     save_checkpoint(tmp_path, tensors, state)
     loaded, again = load_checkpoint(tmp_path)

@@ -3,7 +3,7 @@
 import dataclasses
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -193,9 +193,7 @@ def lack_memory() -> None:
 
 
 @pytest.mark.parametrize("fault", [wait_in_vain, fail, lack_memory])
-def test_a_capture_that_fails_leaves_training_as_it_is(
-    tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch, fault: Callable[[], None]
-) -> None:
+def test_a_capture_that_fails_leaves_training_as_it_is(tiny_scene, monkeypatch, fault):
     """In the middle of a step, too: what it did to the gradients is gone."""
     launched = trained(tiny_scene, cuda_graphs=False)
     replayed: Any = Trainer(tiny_scene, Config(**SETTINGS), "cuda")

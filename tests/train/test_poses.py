@@ -40,10 +40,7 @@ def disturbed(scene: Scene, degrees: float = 0.5, size: float = 0.01) -> Scene:
     views = [*scene.train, *scene.test]
     turns, shifts = torch.nn.functional.normalize(torch.randn(2, len(views), 3, generator=generator), dim=-1)
     twists = torch.cat([turns * degrees * torch.pi / 180, shifts * size], dim=-1)
-    moved = [
-        *moved_by(scene.train, twists, scene.scale),
-        *moved_by(scene.test, twists[len(scene.train) :], scene.scale),
-    ]
+    moved = moved_by(scene.train, twists, scene.scale) + moved_by(scene.test, twists[len(scene.train) :], scene.scale)
     return dataclasses.replace(scene, train=moved[: len(scene.train)], test=moved[len(scene.train) :])
 
 

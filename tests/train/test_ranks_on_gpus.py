@@ -37,9 +37,8 @@ def test_all_ways_of_a_step_give_the_same_bits(tiny_folder: Path, backend: str, 
     )
     assert run.returncode == 0, run.stderr[-2000:]
     told = [json.loads(line) for line in run.stdout.splitlines() if line.startswith("{")]
-    assert [each["mode"] for each in told] == (
-        ["eager", "captured", "beside"] if backend == "nccl" else ["eager", "beside"]
-    )
+    modes = ["eager", "captured", "beside"] if backend == "nccl" else ["eager", "beside"]
+    assert [each["mode"] for each in told] == modes
     assert len({digest for each in told for digest in each["digests"]}) == 1, told
     assert all(len(each["digests"]) == ranks and each["surfels"] > 200 for each in told), told
     assert all((each["graphs"] > 0) == (each["mode"] != "eager") for each in told), told

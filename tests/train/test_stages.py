@@ -167,9 +167,7 @@ def test_a_teacher_is_a_run(run: Path) -> None:
 
 
 @pytest.mark.parametrize("lost", ["student", "teacher 2", "all"])
-def test_a_run_resumes_in_each_stage(
-    run: Path, finished: Path, command: Callable[..., int], capsys: pytest.CaptureFixture[str], lost: str
-) -> None:
+def test_a_run_resumes_in_each_stage(run, finished, command, capsys, lost):
     """With the bits of an uninterrupted one, whatever it still has to train; complete teachers stay as they are."""
     for name in (*CHECKPOINTS, "renders"):
         shutil.rmtree(run / name, ignore_errors=True)
@@ -194,9 +192,7 @@ def test_a_run_resumes_in_each_stage(
 
 
 @pytest.mark.parametrize("stop", [6, 15])
-def test_a_stopped_run_goes_on_where_it_was(
-    finished: Path, command: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: int
-) -> None:
+def test_a_stopped_run_goes_on_where_it_was(finished, command, tmp_path, monkeypatch, stop):
     """Whatever the stage that the signal comes in."""
     steps: list[None] = []
     taken: list[None] = []
@@ -236,9 +232,7 @@ def test_a_longer_run_keeps_its_teachers(run: Path, command: Callable[..., int],
     assert model_of(run) == model
 
 
-def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(
-    run: Path, command: Callable[..., int], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(run, command, capsys):
     for name in ("teachers/1/notes.txt", "teachers/9/model.safetensors", "teachers/mine.txt"):
         (run / name).parent.mkdir(exist_ok=True)
         (run / name).write_text("mine")
@@ -253,9 +247,7 @@ def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(
 
 
 @pytest.mark.parametrize("kind", ["link", "file"])
-def test_what_is_not_the_runs_is_not_taken_for_a_teacher(
-    run: Path, command: Callable[..., int], tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
-) -> None:
+def test_what_is_not_the_runs_is_not_taken_for_a_teacher(run, command, tmp_path, capsys, kind):
     """Nor overwritten: nothing changes."""
     place = run / "teachers"
     place.rename(tmp_path / "elsewhere")
@@ -270,9 +262,7 @@ def test_what_is_not_the_runs_is_not_taken_for_a_teacher(
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
 
 
-def test_a_run_that_lost_a_teacher_says_so_before_it_trains(
-    run: Path, finished: Path, command: Callable[..., int], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_lost_a_teacher_says_so_before_it_trains(run, finished, command, capsys):
     shutil.rmtree(run / "teachers" / "2")
     capsys.readouterr()
     assert command(run, "--resume", iterations=30) == 2
@@ -281,14 +271,11 @@ def test_a_run_that_lost_a_teacher_says_so_before_it_trains(
     assert read_run(run).config.iterations == 20 and not (run / "teachers" / "2").exists()
     shutil.copytree(finished / "teachers" / "1", run / "teachers" / "2")
     assert command(run, "--resume") == 2
-    assert f"{run}/teachers/2:expectedateacherwiththesettingsof{run},gotothers" in "".join(
-        capsys.readouterr().err.split()
-    )
+    told = "".join(capsys.readouterr().err.split())
+    assert f"{run}/teachers/2:expectedateacherwiththesettingsof{run},gotothers" in told
 
 
-def test_an_older_run_keeps_teachers_of_its_own_budget(
-    finished: Path, command: Callable[..., int], tmp_path: Path
-) -> None:
+def test_an_older_run_keeps_teachers_of_its_own_budget(finished, command, tmp_path):
     """Its config.json does not say how large they are; it resumes with the teacher that is complete."""
     whole, run = tmp_path / "whole", tmp_path / "run"
     create_run(whole, dataclasses.replace(read_run(finished), own=OwnTeachers(2, 4)))
@@ -303,9 +290,7 @@ def test_an_older_run_keeps_teachers_of_its_own_budget(
     assert model_of(run) == model_of(whole) != model_of(finished)
 
 
-def test_memory_that_a_teacher_lacks_is_told_as_its_own(
-    command: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_memory_that_a_teacher_lacks_is_told_as_its_own(command, tmp_path, monkeypatch, capsys):
     """Its budget is not that of the run, so that lowering this may not help."""
 
     def fail(*_: object, **__: object) -> None:

@@ -117,9 +117,7 @@ def test_what_belongs_to_a_photo_does_not_count(tiny_scene: Scene, teachers: lis
         assert taught.expected is not None and not taught.expected.any()
 
 
-def test_a_resumed_student_has_the_bits_of_an_uninterrupted_one(
-    tiny_scene: Scene, teachers: list[Model], tmp_path: Path
-) -> None:
+def test_a_resumed_student_has_the_bits_of_an_uninterrupted_one(tiny_scene, teachers, tmp_path):
     whole, alone = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers), Trainer(tiny_scene, CONFIG, CPU)
     for trainer in (whole, alone):
         trainer.run()
@@ -128,9 +126,7 @@ def test_a_resumed_student_has_the_bits_of_an_uninterrupted_one(
 
 
 @pytest.mark.parametrize("kind", ["none", "fewer", "swapped", "bare"])
-def test_a_checkpoint_of_other_teachers_is_refused(
-    tiny_scene: Scene, teachers: list[Model], tmp_path: Path, kind: str
-) -> None:
+def test_a_checkpoint_of_other_teachers_is_refused(tiny_scene, teachers, tmp_path, kind):
     first, second = teachers
     others = {"none": [], "fewer": [first], "swapped": [second, first], "bare": [first.bare(), second]}[kind]
     begun = Trainer(tiny_scene, CONFIG, CPU, teachers=teachers)
@@ -147,9 +143,7 @@ def test_teachers_of_another_scene_are_refused(tiny_scene: Scene, teachers: list
             nw.train(other, CONFIG, device=CPU, teachers=teachers)
 
 
-def test_the_command_learns_from_runs(
-    tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_learns_from_runs(tiny_folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     small = ["--iterations", "10", "--max-surfels", "60", "--device", "cpu", "--set", "texture.table_size=1024"]
 

@@ -76,9 +76,7 @@ def test_an_own_loss_is_added_and_reported(scene: Scene) -> None:
         ({"own": lambda r, t: r.ids.sum()}, TypeError, r"losses\['own'\]: .*, got torch\.int64"),
     ],
 )
-def test_losses_that_do_not_fit_are_named(
-    scene: Scene, losses: dict[str, Any], error: type[Exception], match: str
-) -> None:
+def test_losses_that_do_not_fit_are_named(scene, losses, error, match):
     with pytest.raises(error, match=match):
         run(scene, 1, losses=losses)
 
@@ -184,9 +182,7 @@ def changed(index: int, value: Any) -> Callable[[list[Any]], list[Any]]:
         ("test_every", lambda x: 1, ValueError, r"^test_every: expected 0, or at least 2, got 1$"),
     ],
 )
-def test_what_makes_no_scene_is_named(
-    scene: Scene, argument: str, change: Callable[[Any], Any], error: type[Exception], match: str
-) -> None:
+def test_what_makes_no_scene_is_named(scene, argument, change, error, match):
     given = parts(scene) | {"masks": [None] * 10, "test_every": 8}
     with pytest.raises(error, match=match):
         nw.Scene.from_tensors(**given | {argument: change(given[argument])})

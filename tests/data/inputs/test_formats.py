@@ -97,9 +97,7 @@ def test_lists_of_file_names_make_the_split(demo, tmp_path):
     edit(path, lambda data: data["test_filenames"].clear())
     assert [v.name for v in load_scene(path).test] == ["view_004.png", "view_005.png"]
     edit(path, lambda data: data.update(val_filenames=data["train_filenames"][:1]))
-    with pytest.warns(
-        UserWarning, match="1 photos are listed for training and testing; they are used for testing only"
-    ):
+    with pytest.warns(UserWarning, match="1 photos are listed for training and testing; they are used for testing"):
         scene = load_scene(path)
     assert [v.name for v in scene.test] == ["view_000.png"] and len(scene.train) == 3
 

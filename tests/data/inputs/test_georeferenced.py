@@ -43,9 +43,7 @@ def applied(matrix):
         data = room.transforms([f"images/{name}" for name in names], world[:3])
         points = room.wall_points(300) @ world[:3, :3].T + world[:3, 3]
         write_points(path / "points.ply", points, np.round(room.paint(room.wall_points(300))))
-        return room.write_transforms(
-            path, {**data, "applied_transform": matrix.tolist(), "ply_file_path": "points.ply"}
-        )
+        return room.write_transforms(path, data | {"applied_transform": matrix.tolist(), "ply_file_path": "points.ply"})
 
     return write
 

@@ -113,9 +113,8 @@ def test_a_lens_that_turns_back_is_masked_from_there(tmp_path):
 def test_a_panorama_becomes_six_views(tmp_path):
     path = make_scene(tmp_path / "scene", model="EQUIRECTANGULAR", params=(48.0, 36.0), names=["a.png", "b.png"])
     scene = load_scene(path)
-    assert [v.name for v in scene.test] == [
-        f"a_{face}.png" for face in ("front", "right", "back", "left", "up", "down")
-    ]
+    faces = ("front", "right", "back", "left", "up", "down")
+    assert [view.name for view in scene.test] == [f"a_{face}.png" for face in faces]
     assert len(scene.train) == 6 and all(v.image.shape == (15, 15, 3) for v in scene.train)
     centres = torch.stack([v.camera.position for v in scene.train])
     torch.testing.assert_close(centres, centres[:1].expand(6, 3), rtol=0, atol=1e-6)

@@ -117,7 +117,7 @@ def test_a_line_that_is_none_is_named(tmp_path, part, change, line):
     content = file.read_bytes()
     file.write_bytes(change(content))
     with pytest.raises(
-        ValueError, match=rf"{part}.txt: not a readable COLMAP model: line \d+: expected .*, got '{line}"
+        ValueError, match=rf"{part}.txt: not a readable COLMAP model: line \d+: expected .* got '{line}"
     ):
         load_scene(path)
 
@@ -126,9 +126,7 @@ def test_photos_that_the_model_lacks_are_named(tmp_path):
     path = make_scene(tmp_path)
     for name in ("x.JPG", "y.png"):
         shutil.copy(path / "images/00.png", path / "images" / name)
-    with pytest.warns(
-        UserWarning, match=r"images: 2 of 12 photos are not used, as .*sparse/0 does not .*: x.JPG, y.png"
-    ):
+    with pytest.warns(UserWarning, match=r"images: 2 of 12 photos are not used, as .*sparse/0 .*: x.JPG, y.png"):
         load_scene(path)
 
 

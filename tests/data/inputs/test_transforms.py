@@ -97,9 +97,8 @@ def test_names_and_encodings(tmp_path, kind):
 def test_lists_name_photos_in_any_form(tmp_path):
     names = [unicodedata.normalize("NFD", f"images/\u00e9{index}.png") for index in range(room.VIEWS)]
     listed = [unicodedata.normalize("NFC", name) for name in names]
-    path = write(
-        tmp_path, names=names, test_filenames=[listed[1], str(tmp_path / listed[2])], train_filenames=listed[3:]
-    )
+    test = [listed[1], str(tmp_path / listed[2])]
+    path = write(tmp_path, names=names, test_filenames=test, train_filenames=listed[3:])
     scene = load_scene(path)
     assert [view.name for view in scene.test] == [name[7:] for name in listed[1:3]] and len(scene.train) == 3
 
@@ -107,9 +106,7 @@ def test_lists_name_photos_in_any_form(tmp_path):
 def test_photos_that_no_frame_has_are_named(tmp_path):
     path = write(tmp_path)
     room.save_png(path / "images/other.png", room.photos(1)[0])
-    with pytest.warns(
-        UserWarning, match=r"images: 1 of 7 photos are not used, as .*transforms.json does .*: other.png"
-    ):
+    with pytest.warns(UserWarning, match=r"images: 1 of 7 photos are not used, as .*transforms.json .*: other.png"):
         load_scene(path)
 
 

@@ -41,15 +41,8 @@ def web_model(count: int = 60, *, options: nw.RenderOptions | None = None, **sha
     """
     scene = random_scene(count, width=37, height=27)
     generator = torch.Generator().manual_seed(3)
-    shape = {
-        "levels": 3,
-        "table_size": 2**9,
-        "max_resolution": 8.0,
-        "width": 12,
-        "features": 2,
-        "residual": True,
-    } | shape
-    texture = nw.NeuralTexture(**{"min_resolution": 1.0, "hidden_layers": 2, **shape})
+    small = {"levels": 3, "table_size": 2**9, "min_resolution": 1.0, "max_resolution": 8.0, "features": 2}
+    texture = nw.NeuralTexture(**{**small, "width": 12, "hidden_layers": 2, "residual": True, **shape})
     with torch.no_grad():
         for parameter in texture.parameters():
             parameter.copy_((0.4 * torch.randn(parameter.shape, generator=generator)).half().float())
