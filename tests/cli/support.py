@@ -15,16 +15,8 @@ from tests.trainer_support import OFTEN, TEXTURE
 
 SMALL = Config(texture=TEXTURE, densify=OFTEN)
 FLAGS = ["--iterations", "20", "--max-surfels", "100", "--device", "cpu"]
-RUN_FILES = {
-    "config.json",
-    "model.safetensors",
-    "cameras.json",
-    "metrics.json",
-    "metrics.jsonl",
-    "photos.csv",
-    "renders",
-    "checkpoint",
-}
+RESULTS = {"model.safetensors", "cameras.json", "metrics.json", "metrics.jsonl", "photos.csv", "renders"}
+RUN_FILES = {"config.json", "checkpoint", *RESULTS}
 RUN_FILES |= {"checkpoint.old"}  # where there was more than one
 
 

@@ -21,15 +21,8 @@ def test_existing_run_is_refused_and_untouched(finished, scene, capsys):
     command = ["train", str(scene), "--run", str(finished), *FLAGS]
     refused(capsys, command, str(finished), "exists", "--resume or --overwrite")
     refused(capsys, [*command, "--resume", "--overwrite"], "--resume, --overwrite", "at most one")
-    for flag, value in (
-        ("--iterations", "10"),
-        ("--max-surfels", "99"),
-        ("--max-hits", "1"),
-        ("--seed", "5"),
-        ("--downscale", "2"),
-        ("--images", "images_2"),
-        ("--preset", "paper"),
-    ):
+    other = {"--iterations": "10", "--max-surfels": "99", "--max-hits": "1", "--seed": "5", "--downscale": "2"}
+    for flag, value in (other | {"--images": "images_2", "--preset": "paper"}).items():
         refused(capsys, [*command, "--resume", flag, value], flag, "as in the run to resume", f"got {value}")
     assert snapshot(finished) == before
 
@@ -62,15 +55,8 @@ def test_overwrite_keeps_what_a_run_does_not_write(finished, scene, tmp_path, ca
     elsewhere.mkdir()
     (elsewhere / "0000.png").write_text("a picture")
     (elsewhere / "model.safetensors").write_text("weights")
-    foreign = {
-        "notes.txt",
-        "camera_path_0.json",
-        "renders/test/view_000.txt",
-        "checkpoint/notes.txt",
-        "export/surfels.obj",
-        "mine/model.safetensors",
-        "mine/checkpoint/state.json",
-    }
+    foreign = {"notes.txt", "camera_path_0.json", "renders/test/view_000.txt", "checkpoint/notes.txt"}
+    foreign |= {"export/surfels.obj", "mine/model.safetensors", "mine/checkpoint/state.json"}
     for name in foreign:
         (finished / name).parent.mkdir(parents=True, exist_ok=True)
         (finished / name).write_text(name)

@@ -18,16 +18,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.render import draw
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train import exposure as exposure_calibration
-from nexwarp.train.exposure import (
-    PRIOR,
-    ExposureCalibration,
-    Observations,
-    calibrate_exposures,
-    choose_fit,
-    fit_exposures,
-    observations,
-    solve_gains,
-)
+from nexwarp.train.exposure import Observations, calibrate_exposures, choose_fit, fit_exposures, observations
 from nexwarp.train.losses import SATURATION, as_taken, photo_losses
 from nexwarp.train.recipe import Config, LossWeights, TextureConfig
 from nexwarp.train.target import Target, mean_color
@@ -204,11 +195,11 @@ def test_gains_are_the_least_squares_of_photos_and_points_together(monkeypatch, 
     design = np.zeros((count, photos + points))
     design[np.arange(count), view] = design[np.arange(count), photos + point] = 1.0
     root = np.sqrt(weights)
-    prior = np.sqrt(PRIOR) * np.eye(photos, photos + points)
+    prior = np.sqrt(exposure_calibration.PRIOR) * np.eye(photos, photos + points)
     together = np.concatenate([root[:, None] * design, prior]), np.concatenate([root * observed, np.zeros(photos)])
     expected = np.linalg.lstsq(*together, rcond=None)[0][:photos]
     seen = Observations(view, point, observed[:, None], np.zeros(count), np.zeros((points, 3)))
-    gains = solve_gains(seen, observed, weights, photos)
+    gains = exposure_calibration.solve_gains(seen, observed, weights, photos)
     np.testing.assert_allclose(gains, expected - expected.mean(), rtol=0, atol=1e-10)
 
 
@@ -294,7 +285,7 @@ def test_the_mean_colour_is_that_of_the_mean_exposure():
     scene = 0.1 + 0.2 * torch.rand(48, 64, 3, generator=generator)
     light = present(exposures_.falloff_of(cameras[0]))
     views = [View(c, to_uint8(scene * g * light), None, "") for c, g in zip(cameras, gains, strict=True)]
-    calibration = ExposureCalibration(exposures_, gains, torch.zeros(0, 3))
+    calibration = exposure_calibration.ExposureCalibration(exposures_, gains, torch.zeros(0, 3))
     assert mean_color(views, calibration) == pytest.approx(scene.mean((0, 1)).tolist(), abs=2e-3)
 
 

@@ -8,17 +8,13 @@ import torch
 import warp as wp
 
 from nexwarp.kernels import launch as launching
-from nexwarp.train.recipe import PRESETS, Config
+from nexwarp.train.recipe import PRESETS, Config, with_settings
 from tests.rehearsal import rehearse
 
 CPU = torch.device("cpu")
 
-SETTINGS = {
-    **PRESETS,
-    "no texture": Config(max_hits=0),
-    "poses": Config(refine_poses=True),
-    "deterministic": Config(deterministic=True),
-}
+OTHERS = {"no texture": {"max_hits": 0}, "poses": {"refine_poses": True}, "deterministic": {"deterministic": True}}
+SETTINGS = PRESETS | {name: with_settings(Config(), changes) for name, changes in OTHERS.items()}
 
 
 @pytest.mark.parametrize("name", SETTINGS)

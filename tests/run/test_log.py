@@ -19,12 +19,8 @@ from tests.scene_writers import write_demo
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
-CONFIG = Config(
-    iterations=12,
-    max_surfels=60,
-    texture=TextureConfig(levels=4, table_size=2**8, width=16),
-    densify=DensifyConfig(every=3),
-)
+TEXTURE = TextureConfig(levels=4, table_size=2**8, width=16)
+CONFIG = Config(iterations=12, max_surfels=60, texture=TEXTURE, densify=DensifyConfig(every=3))
 CLOCK = ("iterations_per_second", "seconds", "memory_bytes")
 
 

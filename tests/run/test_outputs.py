@@ -281,10 +281,6 @@ def test_bad_path_files(refuses: Callable[..., None], run: Path) -> None:
     refuses(["render", "--path", path], str(path), "expected JSON")
     save_camera_path(path, ring(2))
     refuses(["render", "--path", path, "--frames", "3"], "--frames: expected no value with", "got 3")
-    data = json.loads(path.read_text())
-    data["camera_path"][1]["camera_to_world"] = [0.0] * 15 + [1.0]
-    path.write_text(json.dumps(data))
-    refuses(["render", "--path", path], f"{path}: camera_path[1]: camera_to_world: expected an invertible pose")
 
 
 def test_cameras_that_no_path_suits(refuses: Callable[..., None], run: Path) -> None:

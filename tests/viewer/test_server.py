@@ -66,8 +66,10 @@ def test_nonsense_is_dropped_and_hurts_nobody(model, capfd):
         bad.send("ShareUrlRequest")
         click = {"ray_origin": (0, 0, 0), "ray_direction": (0, 0, 1), "screen_pos": (0, 0), "modifier": None}
         bad.send("SceneNodeClickMessage", name="/cameras/none", instance_index=None, **click)
-        for wrong in ({"fov": math.nan}, {"wxyz": (0, 0, 0, 0)}, {"image_height": 0}, {"image_width": 10**9}):
+        for wrong in ({"fov": 0.0}, {"fov": math.nan}, {"wxyz": (0, 0, 0, 0)}, {"position": (math.nan, 0, 0)}):
             bad.look(**wrong)
+        for size in (0, 10**9):
+            bad.look(image_width=size)
         bad.send("GuiUpdateMessage", uuid=uuid, updates={"value": 99})
         wait_for(lambda: session.settings.max_hits == 8 and slider.value == 8)  # set one after the other
         assert not slider._impl.removed and session.version == version + 1
