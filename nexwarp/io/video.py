@@ -33,8 +33,6 @@ FASTEST = 1000.0  # frames a second
 CONTAINERS = ("mov", "mp4", "matroska", "webm", "avi", "mpegts")  # FFmpeg's names of those that are read
 READ_OPTIONS = {"format_whitelist": ",".join(CONTAINERS), "protocol_whitelist": "file"}
 LARGEST_FRAME = 40_000_000  # pixels; 8K has 33 million
-LONGEST = 2 * 3600  # seconds
-MOST_FRAMES = 60 * LONGEST
 
 
 def check_video(path: str | os.PathLike[str], fps: float) -> None:
@@ -111,7 +109,7 @@ def read_frames(path: str | os.PathLike[str]) -> Iterator["av.VideoFrame"]:
     """Decode the frames of a video's first video stream, in the order in which they are shown.
 
     SettingError: PyAV (extra `video`) is missing. FormatError: the file is no video in MP4, MOV, Matroska, WebM, AVI or
-    MPEG-TS, has no video stream, is damaged, or has more than 40 megapixels, 2 hours or 432,000 frames.
+    MPEG-TS, has no video stream, is damaged, or has more than 40 megapixels.
     """
     check_av(path)
     import av
@@ -124,26 +122,15 @@ def read_frames(path: str | os.PathLike[str]) -> Iterator["av.VideoFrame"]:
             if not container.streams.video:
                 raise FormatError(f"{path}: expected a video, but the file has no video stream")
             stream = container.streams.video[0]
-            seconds = (container.duration or 0) / av.time_base
-            _check_size(path, stream.width, stream.height, seconds, stream.frames)
+            if stream.width * stream.height > LARGEST_FRAME:
+                most = f"at most {LARGEST_FRAME // 10**6} megapixels, got {stream.width}x{stream.height}"
+                raise FormatError(f"{path}: expected a video of {most}; reduce it")
             stream.codec_context.options = {"max_pixels": str(LARGEST_FRAME)}
             stream.thread_type = "AUTO"
-            for count, frame in enumerate(container.decode(stream), start=1):
-                _check_size(path, frame.width, frame.height, frame.time or 0.0, count)
-                yield frame
+            yield from container.decode(stream)
     except av.error.FFmpegError as error:
         known = f"; the formats {', '.join(CONTAINERS)} are read"
         raise FormatError(f"{path}: expected a video, could not decode it ({one_line(error)}){known}") from None
-
-
-def _check_size(path: str | os.PathLike[str], width: int, height: int, seconds: float, count: int) -> None:
-    """Raise FormatError for frames of too many pixels, or too many frames."""
-    if width * height > LARGEST_FRAME:
-        limit = LARGEST_FRAME // 10**6
-        raise FormatError(f"{path}: expected a video of at most {limit} megapixels, got {width}x{height}; reduce it")
-    if seconds > LONGEST or count > MOST_FRAMES:
-        expected = f"expected a video of at most {LONGEST:,} s and {MOST_FRAMES:,} frames"
-        raise FormatError(f"{path}: {expected}, got more; cut it")
 
 
 def frame_pixels(frame: "av.VideoFrame") -> np.ndarray:
