@@ -401,15 +401,14 @@ def with_settings(config: Config, settings: Mapping[str, object]) -> Config:
     for name, value in settings.items():
         _check_name(name)
         part, _, key = name.rpartition(".")
-        hints = get_type_hints(type(getattr(config, part) if part else config))
-        changes.setdefault(part, {})[key] = typed(name, value, hints[key])
+        changes.setdefault(part, {})[key] = value
     whole = changes.pop("", {})
     for part, values in changes.items():
         try:
             whole[part] = dataclasses.replace(getattr(config, part), **values)
         except ValueError as error:  # which names the setting without the part
             raise ValueError(f"{part}.{error}") from None
-    return dataclasses.replace(config, **whole)  # type: ignore[arg-type]  # typed has checked them
+    return dataclasses.replace(config, **whole)  # type: ignore[arg-type]  # it checks them
 
 
 def parse_settings(texts: Iterable[str]) -> dict[str, Json]:
