@@ -77,7 +77,7 @@ MUTATIONS = [
     Mutation("train/densify.py", "value[sides != 0] = 0", "pass", DENSE),
     Mutation("train/densify.py", "/ errors\n", "* errors\n", DENSE),
     Mutation("train/densify.py", "c.start < iteration - late < c.stop", "c.start <= iteration - late <= c.stop", DENSE),
-    Mutation("train/losses.py", "/ resolutions**3", "/ resolutions**2", "tests/train/test_losses.py"),
+    Mutation("train/optimizer.py", "cells_unit) ** 3", "cells_unit) ** 2", "tests/ops/test_adam.py"),
     Mutation("train/losses.py", '"l1": 1.0 - factors.dssim', '"l1": 1.0', "tests/train/test_losses.py"),
     Mutation("train/optimizer.py", "EPSILON = 1e-15", "EPSILON = 1e-8", "tests/train/test_trainer.py -k log_linear"),
     Mutation("train/parallel.py", "1.0 / self.views_a_step if", "1.0 / ranks.size if", "tests/train/test_parallel.py -k incomplete"),
