@@ -251,8 +251,6 @@ BAD_SCENES = {
     "truncated photo": (damaged("images/03.png"), UNDECODABLE),
     "no photo at all": (damaged("images/03.png", lambda data: b"<html>not found</html>"), UNDECODABLE),
     "photos of another shape": (tall, "00.png: expected an image of 48x36 .* got 36x48"),
-    "empty cameras": (damaged("sparse/0/cameras.bin", lambda data: b""), "cameras.bin: truncated or damaged"),
-    "garbage text": (damaged("sparse/0/images.txt", lambda _: b"what\n", text=True), "not a readable COLMAP"),
     "image id beyond 32 bits": (
         damaged("sparse/0/images.txt", lambda data: re.sub(rb"(?m)^1 ", b"18446744073709551617 ", data), text=True),
         "expected id, pose, camera and name of an image, or its keypoints, got '18446744073709551617",
@@ -284,5 +282,3 @@ def test_bad_downscale(tmp_path):
         load_scene(path, downscale=0)
     with pytest.raises(TypeError, match="downscale: expected an int, got float"):
         load_scene(path, downscale=2.0)  # type: ignore[arg-type]  # what is refused
-    with pytest.raises(ValueError, match=r"downscale: expected at most the size of .*, 48x36, got 37"):
-        load_scene(path, downscale=37)

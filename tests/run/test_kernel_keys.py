@@ -8,13 +8,13 @@ import torch
 import warp as wp
 
 from nexwarp.kernels import launch as launching
-from nexwarp.train.recipe import PRESETS, Config, with_settings
+from nexwarp.train.recipe import PRESETS, Config
 from tests.rehearsal import rehearse
 
 CPU = torch.device("cpu")
 
-OTHERS = {"no texture": {"max_hits": 0}, "poses": {"refine_poses": True}, "deterministic": {"deterministic": True}}
-SETTINGS = PRESETS | {name: with_settings(Config(), changes) for name, changes in OTHERS.items()}
+SETTINGS = PRESETS | {"no texture": Config(max_hits=0), "poses": Config(refine_poses=True)}
+SETTINGS |= {"deterministic": Config(deterministic=True)}
 
 
 @pytest.mark.parametrize("name", SETTINGS)
