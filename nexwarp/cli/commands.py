@@ -27,7 +27,7 @@ from nexwarp.io.json_files import READ_ERRORS, Json, read_object, write_json
 from nexwarp.model.edit import write_edits
 from nexwarp.model.model import Model
 from nexwarp.model.texture import NeuralTexture
-from nexwarp.run.edit import EditOrder, added, crop_command, described
+from nexwarp.run.edit import EditOrder, added, crop_command, described, measured
 from nexwarp.run.evaluate import check_metrics, evaluate
 from nexwarp.run.export import RENDERED, ExportOrder, export_run
 from nexwarp.run.fit_poses import fit_poses
@@ -391,6 +391,7 @@ class ViewCommand:
                 keep_camera_path, opened.folder, opened=self.run, origin=model.origin, frame=opened.frame
             ),
             crop_command=partial(crop_command, opened),
+            measured=partial(measured, opened),
         ) as viewer:
             show_until_interrupted(viewer, console)
 

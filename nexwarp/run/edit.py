@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import shlex
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -135,7 +136,23 @@ def described(opened: OpenedModel) -> list[str]:
 def crop_command(opened: OpenedModel, centre: np.ndarray, radius: float) -> str:
     """Return the command that crops a run by a sphere, whose centre (3,) and radius are in the frame of its cameras."""
     numbers = (*opened.frame.points(centre), radius * opened.frame.scale)
-    return f"nexwarp edit {opened.path} --crop sphere {' '.join(f'{x:.4g}' for x in numbers)}"
+    return f"nexwarp edit {shlex.quote(str(opened.path))} --crop sphere {' '.join(f'{x:.4g}' for x in numbers)}"
+
+
+def measured(opened: OpenedModel, points: np.ndarray, length: float) -> list[str]:
+    """Return lines, in Markdown, on one or two points (N, 3) in the frame of a run's cameras.
+
+    They have the points in the coordinates of exports and, of two, the distance there and the command that makes it
+    `length`, in the unit of exports.
+    """
+    places = opened.frame.points(points)
+    texts = [" ".join(f"{x:.6g}" for x in place) for place in places]
+    lines = [f"`{text}`" for text in texts]
+    if len(places) == 2:
+        lines.append(f"**{math.dist(*places):.4g} units**")
+        command = f"nexwarp edit {shlex.quote(str(opened.path))} --scale-between {' '.join(texts)} {length:g}"
+        lines.append(f"`{command}`")
+    return lines
 
 
 def subject_crop(opened: OpenedModel) -> Edit | None:

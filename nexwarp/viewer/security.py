@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 TOKEN_BYTES = 24  # 192 bits
 MAX_MESSAGE_BYTES = 2**16  # of one message of a browser; the largest that the panels send has a few hundred
 CLOSE_SECONDS = 2.0  # in which a client must answer a farewell
-ACCEPTED = {"ViewerCameraMessage", "GuiUpdateMessage", "SceneNodeClickMessage"}
+ACCEPTED = {"ViewerCameraMessage", "GuiUpdateMessage", "SceneNodeClickMessage", "ScenePointerMessage"}
 HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": "frame-ancestors 'self'",  # no page of another server shows the viewer in a frame

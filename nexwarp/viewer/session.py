@@ -3,7 +3,7 @@
 The panel of each tab has values that are clamped to their ranges, and an editor of camera paths: views that a browser
 adds, to play and to keep for `nexwarp render --path`. Another one, of a training, is for all. Events that are
 coroutines run on viser's event loop, one after another. Functions would wait for a thread of its pool, in a queue
-without a limit.
+without a limit. What needs a rendering, such as a measured point, waits for the thread that draws.
 """
 
 import asyncio
@@ -11,6 +11,7 @@ import html
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from functools import partial
@@ -39,6 +40,8 @@ SECONDS = (0.1, 600.0)
 MOST_VIEWS = 200  # of a path
 FOV_DEGREES = (15.0, 110.0)
 CROP_RADII, CROP_REACH = (0.05, 10.0), 100.0  # of a sphere, and of its centre's coordinates; browser units
+LENGTHS = (1e-3, 1e6)  # known, between measured points
+MARK = 0.008  # radius of a measured point, in distances from the camera
 SCREENSHOT_HEIGHTS = (64, 2160)
 TELL_SECONDS = 0.5  # between two updates of a training's status line
 # Settings with a control, its label and hint; `Settings` has the values of a checkbox, `RANGES` those of a slider.
@@ -171,6 +174,68 @@ class CropEditor:
         self.note.content = f"`{self.command(self.world.to_scene(centre), radius * self.world.unit)}`"
 
 
+class MeasureEditor:
+    """Two points of the scene that one client clicks, and what the run says of them."""
+
+    def __init__(self, session: "Session", describe: Callable[[np.ndarray, float], list[str]]) -> None:
+        self.session, self.describe = session, describe
+        self.clicks: deque[tuple[Viewpoint, tuple[float, float]]] = deque(maxlen=2)  # not looked up yet
+        self.points = np.zeros((0, 3))  # in the scene's frame
+        gui, scene = session.client.gui, session.client.scene
+        self.active = gui.add_checkbox("Measure", False, hint="Clicks choose points, and no cameras")
+        self.length = gui.add_number("Known length", 1.0, min=LENGTHS[0], max=LENGTHS[1], step=0.001)
+        self.note = gui.add_markdown("")
+        colour, ends = COLOURS["test"], ("/first", "/second")
+        self.balls = [scene.add_icosphere(end, 1.0, colour, cast_shadow=False, receive_shadow=False) for end in ends]
+        self.line = scene.add_line_segments(
+            "/between", np.zeros((1, 2, 3)), colour, thickness=2.0, thickness_units="screen"
+        )
+        on_change(self.active, self.toggle)
+        on_change(self.length, lambda _: self.update())
+        self.update()
+
+    def toggle(self, active: bool) -> None:
+        """Begin to listen to clicks on the picture, or end it and forget the points."""
+        self.session.client.scene.remove_click_callback(self.clicked)
+        if active:
+            self.session.client.scene.on_click()(self.clicked)  # type: ignore[arg-type]  # a coroutine
+        self.clicks.clear()
+        self.points = self.points[:0]
+        self.update()
+
+    async def clicked(self, event: "viser.SceneClickEvent") -> None:
+        """Let the thread that draws look up the point of a click, at (x, y) from 0 to 1; others are ignored."""
+        view = self.session.viewpoint
+        with suppress(TypeError, ValueError):
+            x, y = (within(at, (0.0, 1.0)) for at in event.screen_pos)
+            if view is not None:
+                self.clicks.append((view, (x, y)))
+                self.session.viewer.wake()
+
+    def add(self, view: Viewpoint, point: np.ndarray | None) -> None:
+        """Take up the point (3,) of a click in a view, None where nothing is; the third one begins anew."""
+        if not self.active.value:
+            return
+        if point is None:
+            self.note.content = "No surface is there: click again"
+            return
+        number = len(self.points) % 2
+        self.points = np.concatenate([self.points[:number], point[None]])
+        self.balls[number].position = _triple(self.session.world.to_browser(point))
+        self.balls[number].scale = MARK * float(np.linalg.norm(point - view.pose[:3, 3])) / self.session.world.unit
+        self.update()
+
+    def update(self) -> None:
+        """Mark the points, and show what the run says of them."""
+        points = self.points
+        if len(points) == 2:
+            self.line.points = self.session.world.to_browser(points)[None].astype(np.float32)
+        self.balls[0].visible, self.balls[1].visible = len(points) > 0, len(points) == 2
+        self.line.visible = len(points) == 2
+        lines = self.describe(points, within(float(self.length.value), LENGTHS)) if len(points) else []
+        self.note.content = "  \n".join(lines) or "Click two points of the picture"
+
+
 class TrainingPanel:
     """The controls of a training: progress and pause."""
 
@@ -225,6 +290,7 @@ class Session:
         self.drawn_version = self.drawn_step = -1
         self.drawn_scale = self.drawn_at = 0.0
         self.screenshot: int | None = None  # height of the one that is requested and not drawn yet, pixels
+        self.measure: MeasureEditor | None = None
         self.closed = threading.Event()
         self.controls: dict[str, viser.GuiInputHandle[Any]] = {}  # by the name of the setting
         gui = client.gui
@@ -232,9 +298,9 @@ class Session:
         for label, add in (("Look", self._look), ("Cameras", self._cameras), ("Record", self._record)):
             with tabs.add_tab(label):
                 add()
-        if viewer.crop_command is not None:
-            with tabs.add_tab("Crop"):
-                self.crop = CropEditor(self, viewer.crop_command)
+        if viewer.crop_command is not None or viewer.measured is not None:
+            with tabs.add_tab("Edit"):
+                self._edit()
         gui.add_divider(order=15.0)
         gui.add_markdown(HELP, order=20.0)
         self._add_frustums()
@@ -322,7 +388,8 @@ class Session:
             self.frustums[name].on_click(partial(self._clicked, name))
 
     async def _clicked(self, name: str, _: object) -> None:
-        self.jump(name)
+        if self.measure is None or not self.measure.active.value:
+            self.jump(name)
 
     def _hide_near(self) -> None:
         """Hide the frustums around the browser's camera, which would cover the view."""
@@ -396,6 +463,13 @@ class Session:
         if self.viewer.save_path is not None:
             gui.add_divider()
             self.path = PathEditor(self, self.viewer.keep_path)
+
+    def _edit(self) -> None:
+        if self.viewer.measured is not None:
+            self.measure = MeasureEditor(self, self.viewer.measured)
+            self.client.gui.add_divider()
+        if self.viewer.crop_command is not None:
+            self.crop = CropEditor(self, self.viewer.crop_command)
 
     def _take_screenshot(self, height: float) -> None:
         """Request a picture of this height in pixels, in place of one that is not drawn yet."""

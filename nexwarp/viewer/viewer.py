@@ -24,7 +24,7 @@ from nexwarp.model.model import Model
 from nexwarp.viewer import pacing
 from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
 from nexwarp.viewer.session import Session, TrainingPanel
-from nexwarp.viewer.world import Viewpoint, World, clearest
+from nexwarp.viewer.world import Viewpoint, World, clearest, surface_point
 
 if TYPE_CHECKING:
     import viser
@@ -60,6 +60,7 @@ class Viewer:
         photos: Mapping[str, Callable[[], torch.Tensor]] | None = None,
         save_path: Callable[[Sequence[Camera]], str] | None = None,
         crop_command: Callable[[np.ndarray, float], str] | None = None,
+        measured: Callable[[np.ndarray, float], list[str]] | None = None,
     ) -> None:
         """Start the server. ValueError: the package viser is missing, or the address cannot be used.
 
@@ -70,8 +71,10 @@ class Viewer:
             photos: "set/name" -> function that returns the (H, W, 3) uint8 photo, for thumbnails.
             save_path: writes a camera path into the run and returns the command that renders it; None offers none.
             crop_command: returns the command that crops by a sphere, of its centre (3,) and radius; None offers none.
+            measured: returns lines on one or two points (N, 3), whose true distance is a length; None offers none.
         """
-        self.model, self.options, self.save_path, self.crop_command = model, options, save_path, crop_command
+        self.model, self.options, self.save_path = model, options, save_path
+        self.crop_command, self.measured = crop_command, measured
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
         self.photos = photos or {}
         means = model().surfels.means
@@ -168,7 +171,11 @@ class Viewer:
             start = time.perf_counter()
             is_first = _kind(session.settings) not in self.pace.seconds_per_pixel
             try:
-                if session.screenshot is not None:
+                if session.measure is not None and session.measure.clicks:
+                    session.drawn_at = start
+                    view, place = session.measure.clicks.popleft()
+                    session.measure.add(view, surface_point(self.model(), view, place, self.options.near))
+                elif session.screenshot is not None:
                     self._screenshot(session, session.screenshot)
                 elif scale := self._due(session, longest, start):
                     self._draw(session, scale)

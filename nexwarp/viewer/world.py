@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from nexwarp.cameras.camera import Camera, in_image
 from nexwarp.cameras.paths import focus, up_direction
+from nexwarp.model.model import Model
 from nexwarp.viewer.pacing import MOST_SIDE
 
 # The browser moves two units a second, so that it crosses a scene of this radius in three seconds.
@@ -21,6 +22,7 @@ MOST_COMPARED = 300  # cameras, for the first view
 FRUSTUM_SHARE = 0.4  # size of a frustum, in distances of neighbouring cameras
 SMALLEST_FRUSTUM, LARGEST_FRUSTUM = 0.02, 0.16  # browser units; all cameras lie within RADIUS of the origin
 BAND_ROWS = 16  # rows of a tile
+LEAST_ALPHA = 0.25  # of a pixel that shows a surface
 
 FloatVector: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
 
@@ -130,6 +132,22 @@ class LimitedCamera(Camera):
     def focal(self) -> float:
         """Focal length for the weights of the texture's levels (paper Eq. 4), pixels."""
         return min(self.pixel_focal, self.focal_limit)
+
+
+@torch.no_grad()
+def surface_point(model: Model, view: Viewpoint, place: tuple[float, float], near: float) -> np.ndarray | None:
+    """Return the point (3,) float64, scene's frame, of the surface at (x, y) of a view, from (0, 0) to (1, 1).
+
+    It is at the median depth of the pixel there; None where the surfels cover less than `LEAST_ALPHA` of it.
+    """
+    (camera,) = view.bands(1.0, near, model.surfels.means)
+    column, row = (min(int(x * size), size - 1) for x, size in zip(place, (view.width, view.height), strict=True))
+    pixel = camera.crop(column, row, 1, 1)
+    rendering = model.bare().render(pixel)
+    if rendering.alpha.item() < LEAST_ALPHA:
+        return None
+    ray = np.array([(0.5 - pixel.cx) / pixel.fx, (0.5 - pixel.cy) / pixel.fy, 1.0])
+    return view.pose[:3, :3] @ ray * rendering.median_depth.item() + view.pose[:3, 3]
 
 
 def clearest(cameras: Sequence[Camera]) -> Camera:

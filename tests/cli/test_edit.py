@@ -21,7 +21,7 @@ from nexwarp.model.edit import EDIT_FILE
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import load
 from nexwarp.model.surfels import Surfels
-from nexwarp.run.edit import crop_command
+from nexwarp.run.edit import crop_command, measured
 from nexwarp.run.folder import keep_camera_path, open_model
 from tests.cli.support import picture, read, refused, snapshot
 from tests.scenes import rigid
@@ -106,6 +106,24 @@ def test_the_viewer_s_command_crops_by_the_sphere_it_shows(finished, capsys):
     program, *arguments = shlex.split(crop_command(opened, centre, radius))
     assert program == "nexwarp" and cli.main(arguments) == 0
     assert open_model(finished).kept.mean() == pytest.approx(0.4, abs=0.03)
+
+
+def test_measured_points_are_those_of_exports_and_their_command_scales(finished):
+    """Afterwards their distance is the length."""
+    edit(finished, "--origin", "1", "-2", "3e-5")
+    opened = open_model(finished)
+    points = opened.trained.surfels.means.detach().double().numpy()[[0, 1]]
+    before = math.dist(*opened.frame.points(points))
+    (one,) = measured(opened, points[:1], 2.5)
+    *places, distance, command = measured(opened, points, 2.5)
+    assert cli.main(["export", str(finished)]) == 0
+    for place, exported in zip(places, centres(finished)[:2], strict=True):
+        np.testing.assert_allclose([float(x) for x in place.strip("`").split()], exported, rtol=1e-5, atol=1e-5)
+    assert one == places[0] and distance == f"**{before:.4g} units**"
+    program, *arguments = shlex.split(command.strip("`"))
+    assert program == "nexwarp" and cli.main(arguments) == 0
+    *_, distance, _ = measured(open_model(finished), points, 2.5)
+    assert distance == "**2.5 units**"
 
 
 def test_the_list_says_where_the_subject_is(trained, capsys):

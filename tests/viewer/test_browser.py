@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
+from nexwarp.viewer.world import surface_point
 from tests.viewer.support import serving, wait_for
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -23,7 +25,10 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 def test_in_a_browser(model, monkeypatch):
     api = pytest.importorskip("playwright.sync_api")
     errors: list[str] = []
-    with serving(model) as viewer, api.sync_playwright() as playwright:
+    with (
+        serving(model, measured=lambda points, _: [f"measured {len(points)}"]) as viewer,
+        api.sync_playwright() as playwright,
+    ):
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         page = browser.new_page(viewport={"width": 900, "height": 700})
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
@@ -88,6 +93,23 @@ def test_in_a_browser(model, monkeypatch):
         settled()
         assert session.viewpoint is not None
         assert not np.allclose(session.viewpoint.pose, session.home.pose, atol=1e-3), "dragging moves the camera"
+        page.get_by_role("tab", name="Edit").click()
+        page.get_by_label("Measure").click()
+
+        def is_hit(x: int, y: int) -> bool:
+            """Whether a surface is there, and beside it."""
+            around = [((x + shift) / 900, (y + shift) / 700) for shift in (-6, 0, 6)]
+            assert session.viewpoint is not None
+            return all(surface_point(model, session.viewpoint, place, 0.01) is not None for place in around)
+
+        hits = [(x, y) for y in range(260, 680, 20) for x in range(30, 470, 20) if is_hit(x, y)]
+        for count, (x, y) in enumerate((hits[0], hits[-1]), 1):
+            page.mouse.click(x, y)
+            page.get_by_text(f"measured {count}").wait_for()
+        assert session.measure is not None
+        (camera,) = session.viewpoint.bands(1.0, 0.01, torch.zeros(0, dtype=torch.float64))
+        pixels, _ = camera.project(torch.from_numpy(session.measure.points))
+        np.testing.assert_allclose(pixels * 900 / camera.width, (hits[0], hits[-1]), atol=1.5)
         page.get_by_role("tab", name="Record").click()
         with page.expect_download() as shot:
             page.get_by_role("button", name="Save screenshot").click()
