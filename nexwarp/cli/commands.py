@@ -22,7 +22,7 @@ from nexwarp.data.scene import DEMO, SceneSource, scene_kinds
 from nexwarp.data.sfm import SfmOptions, process
 from nexwarp.data.sfm.photos import FILMS, OTHERS, SUFFIXES
 from nexwarp.data.sfm.process import FRAMES, REPORT_FILE, source_identity
-from nexwarp.errors import MissingError, RunError, SceneError
+from nexwarp.errors import FormatError, MissingError, RunError, SceneError
 from nexwarp.io.json_files import READ_ERRORS, Json, read_object, write_json
 from nexwarp.model.edit import write_edits
 from nexwarp.model.model import Model
@@ -33,6 +33,7 @@ from nexwarp.run.export import RENDERED, ExportOrder, export_run
 from nexwarp.run.fit_poses import fit_poses
 from nexwarp.run.folder import (
     METRICS_FILE,
+    PHOTOS_FILE,
     RENDERS_FOLDER,
     OpenedModel,
     keep_camera_path,
@@ -379,9 +380,15 @@ class ViewCommand:
 
     def __call__(self, console: Console) -> None:
         """Serve the viewer until Ctrl-C."""
+        from nexwarp.run.photo_table import load_photo_table
         from nexwarp.viewer import Viewer, ViewerOptions
 
         opened = open_model(self.run)
+        try:
+            figures_of_photos = load_photo_table(opened.folder / PHOTOS_FILE)
+        except FormatError as error:
+            display.warn(console, f"{error}; the viewer lists no photos")
+            figures_of_photos = {}
         model = opened.model.to(pick_device(self.device))
         with Viewer(
             lambda: model,
@@ -392,6 +399,7 @@ class ViewCommand:
             ),
             crop_command=partial(crop_command, opened),
             measured=partial(measured, opened),
+            figures=figures_of_photos,
         ) as viewer:
             show_until_interrupted(viewer, console)
 

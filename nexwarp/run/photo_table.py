@@ -2,14 +2,19 @@
 
 import csv
 import io
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
 from nexwarp.data import View
 from nexwarp.data.sfm.frames import photo_luma, reduced_luma, sharpness
-from nexwarp.io.files import write_atomically
+from nexwarp.errors import FormatError
+from nexwarp.io.files import one_line, write_atomically
 from nexwarp.run.evaluate import Values
+
+COLUMNS = ["photo", "split", "psnr", "sharpness"]
+MOST_CHARACTERS = 2**23  # of a table; 30,000 photos have about 1.5 million
 
 
 def save_photo_table(file: Path, sets: Mapping[str, Sequence[View]], judged: Mapping[str, Values]) -> None:
@@ -24,7 +29,30 @@ def save_photo_table(file: Path, sets: Mapping[str, Sequence[View]], judged: Map
     ]
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(("photo", "split", "psnr", "sharpness"))
+    table.writerow(COLUMNS)
     for name, split, psnr, sharp in sorted(rows, key=lambda row: row[2]):
         table.writerow((name, split, f"{psnr:.3f}", f"{sharp:.4g}"))
     write_atomically(file, text.getvalue().encode())
+
+
+def load_photo_table(file: Path) -> dict[str, tuple[float, float]]:
+    """Read PSNR in dB and sharpness by "set/name", the lowest PSNR first; nothing where there is no file.
+
+    FormatError: the file is damaged.
+    """
+    if not file.is_file():
+        return {}
+    try:
+        with file.open(newline="", encoding="utf-8") as opened:
+            text = opened.read(MOST_CHARACTERS + 1)
+        if len(text) > MOST_CHARACTERS:
+            raise ValueError(f"expected at most {MOST_CHARACTERS:,} characters")
+        lines = csv.reader(io.StringIO(text), strict=True)
+        if (header := next(lines, [])) != COLUMNS:
+            raise ValueError(f"expected the columns {', '.join(COLUMNS)}, got {', '.join(header)!r:.60}")
+        table = {f"{split}/{name}": (float(psnr), float(sharp)) for name, split, psnr, sharp in lines}
+        if any(math.isnan(value) for values in table.values() for value in values):
+            raise ValueError("expected numbers, got nan")
+    except (OSError, ValueError, csv.Error) as error:
+        raise FormatError(f"{file}: expected the photos of a run ({one_line(error)})") from None
+    return dict(sorted(table.items(), key=lambda row: row[1][0]))

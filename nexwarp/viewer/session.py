@@ -9,10 +9,12 @@ without a limit. What needs a rendering, such as a measured point, waits for the
 import asyncio
 import html
 import math
+import shlex
+import statistics
 import threading
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 COLOURS = {"train": (64, 130, 240), "test": (245, 150, 40)}
 MOST_FRUSTUMS = 500
+MOST_LISTED = 500  # photos, the worst ones
 FPS, PLAY_FPS = 30, 20  # of a camera path, as it is kept and played
 SECONDS = (0.1, 600.0)
 MOST_VIEWS = 200  # of a path
@@ -451,6 +454,35 @@ class Session:
         on_click(gui.add_button("Go there", icon=Icon.CAMERA), lambda: self.jump(jump.value))
         visible = gui.add_checkbox("Show cameras", True, hint="Blue: training views. Orange: test views.")
         on_change(visible, lambda shown: set_changed(self.group, "visible", bool(shown)))
+        if self.viewer.figures:
+            with gui.add_folder("Photos"):
+                self._photos(self.viewer.figures)
+
+    def _photos(self, figures: Mapping[str, tuple[float, float]]) -> None:
+        """Add the list of the worst photos: a choice goes to the camera, and shows how to leave the photo out."""
+        from viser import Icon
+
+        gui = self.client.gui
+        names = {f"{figures[name][0]:.2f} dB {name}": name for name in list(figures)[:MOST_LISTED]}
+        typical = [statistics.median(column) for column in zip(*figures.values(), strict=True)]
+        chosen = gui.add_dropdown("Worst first", tuple(names), hint="PSNR of each photo")
+        note = gui.add_html("")
+
+        def show(label: str) -> None:
+            name = names[label]
+            psnr, sharp = figures[name]
+            option = html.escape(f"--exclude {shlex.quote(name.partition('/')[2])}")
+            text = f"PSNR {psnr:.2f} dB, sharpness {sharp:.3g}; medians {typical[0]:.2f} dB, {typical[1]:.3g}"
+            note.content = f'<div style="{SMALL}">{text}<br><code>{option}</code></div>'
+
+        def go(label: str) -> None:
+            if label in names:  # else it is none that the panel offers
+                show(label)
+                self.jump(names[label])
+
+        show(chosen.value)
+        on_change(chosen, go)
+        on_click(gui.add_button("Go to the photo", icon=Icon.CAMERA), lambda: go(chosen.value))
 
     def _record(self) -> None:
         from viser import Icon

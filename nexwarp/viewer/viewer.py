@@ -61,6 +61,7 @@ class Viewer:
         save_path: Callable[[Sequence[Camera]], str] | None = None,
         crop_command: Callable[[np.ndarray, float], str] | None = None,
         measured: Callable[[np.ndarray, float], list[str]] | None = None,
+        figures: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         """Start the server. ValueError: the package viser is missing, or the address cannot be used.
 
@@ -71,10 +72,11 @@ class Viewer:
             photos: "set/name" -> function that returns the (H, W, 3) uint8 photo, for thumbnails.
             save_path: writes a camera path into the run and returns the command that renders it; None offers none.
             crop_command: returns the command that crops by a sphere, of its centre (3,) and radius; None offers none.
+            figures: "set/name" -> PSNR in dB and sharpness of a photo, the worst first; None or empty lists none.
             measured: returns lines on one or two points (N, 3), whose true distance is a length; None offers none.
         """
         self.model, self.options, self.save_path = model, options, save_path
-        self.crop_command, self.measured = crop_command, measured
+        self.crop_command, self.measured, self.figures = crop_command, measured, figures or {}
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
         self.photos = photos or {}
         means = model().surfels.means
