@@ -38,6 +38,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
 from nexwarp.model.texture import DetailLimits
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
+from nexwarp.run.photo_table import load_photo_table
 from nexwarp.train.recipe import Config, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.model_file_support import make_model
@@ -205,6 +206,13 @@ def _metrics(folder: Path) -> list[Files]:
     return [_files(folder)]
 
 
+def _photo_table(folder: Path) -> list[Files]:
+    folder.mkdir(parents=True, exist_ok=True)
+    table = 'photo,split,psnr,sharpness\n"a, b.png",test,inf,0.3\nc/d.png,train,20.125,1e-05\n'
+    (folder / "photos.csv").write_text(table)
+    return [_files(folder)]
+
+
 def _edits(folder: Path) -> list[Files]:
     rotation = (0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
     edits = [Edit("box", (-1, -2, -3, 4, 5, 6.5)), Edit("level", (*rotation, 0.0, 1.0, 2.0)), Edit("scale", (2.5,))]
@@ -350,6 +358,7 @@ TARGETS = {
         FuzzTarget("cameras", _run_cameras, _read_cameras, (".json",)),
         FuzzTarget("checkpoint", _checkpoint, _read_checkpoint, (".json", ".safetensors")),
         FuzzTarget("metrics", _metrics, read_metrics, (".json",)),
+        FuzzTarget("photo_table", _photo_table, lambda folder: load_photo_table(folder / "photos.csv"), (".csv",)),
         FuzzTarget("edits", _edits, _read_edits, (".json",)),
         FuzzTarget("camera_path", _camera_path, _read_camera_path, (".json",)),
         FuzzTarget("ply", _ply, lambda folder: read_ply(folder / "points.ply"), (".ply",)),
