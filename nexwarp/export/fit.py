@@ -16,7 +16,7 @@ from nexwarp.kernels.types import ALPHA_MAX
 from nexwarp.model.model import Model
 from nexwarp.ops.atlas import Cut
 
-WINDOW = 256  # largest width and height that one step draws
+WINDOW = {"cuda": 1024, "cpu": 256}  # largest width and height that one step draws
 PASSES = 12.0  # over the views' pixels
 FEWEST_STEPS = 400
 MOST_STEPS = {"cuda": 20_000, "cpu": 2000}
@@ -58,10 +58,14 @@ def fit(
     the model's rendering from a new camera beside the view, so that no photo is learnt by heart. The number of steps
     follows from that of pixels unless it is given.
     """
-    device = scene.texels.device
+    device = scene.texels.device.type
+    largest = WINDOW[device]
     if steps is None:
-        windows = sum(camera.width * camera.height for camera in cameras_of(views)) / WINDOW**2
-        steps = min(max(round(PASSES * windows), FEWEST_STEPS), MOST_STEPS.get(device.type, FEWEST_STEPS))
+        sizes = [(camera.width, camera.height) for camera in cameras_of(views)]
+        pixels = sum(width * height for width, height in sizes)
+        drawn = sum(min(width, largest) * min(height, largest) for width, height in sizes) / max(len(sizes), 1)
+        steps = round(PASSES * pixels / max(drawn, WINDOW["cpu"] ** 2))
+        steps = min(max(steps, FEWEST_STEPS), MOST_STEPS[device])
     start = {"texels": scene.texels.flatten(0, 1)}
     if scene.harmonics is not None:
         start |= {"sh0": scene.harmonics[0], "shN": scene.harmonics[1]}
@@ -72,7 +76,7 @@ def fit(
     optimizer = torch.optim.SparseAdam(groups, betas=(0.9, 0.99), eps=1e-12)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, LAST_RATE ** (1 / max(steps, 1)))
     scene = replace(scene, exposures=None)
-    for done, window in zip(range(1, steps + 1), _windows(model, views), strict=False):
+    for done, window in zip(range(1, steps + 1), _windows(model, views, largest), strict=False):
         image = _drawn(scene, trained, done / steps).render(window.camera, background=model.options.background)
         if window.factors is not None:
             image = image * window.factors
@@ -112,7 +116,7 @@ def _drawn(scene: BakedScene, trained: dict[str, torch.Tensor], share: float | N
     return replace(scene, shape=shape, harmonics=(trained["sh0"], trained["shN"]))
 
 
-def _windows(model: Model, views: Views) -> Iterator[Window]:
+def _windows(model: Model, views: Views, largest: int) -> Iterator[Window]:
     """Yield windows of all views in a random order, over and over, each followed by one of a new camera beside it."""
     order = torch.Generator().manual_seed(0)
     while views:
@@ -120,15 +124,15 @@ def _windows(model: Model, views: Views) -> Iterator[Window]:
         for index in torch.randperm(len(views), generator=order).tolist():
             view = views[index]
             if isinstance(view, View):
-                yield _photo_window(model, view, order)
+                yield _photo_window(model, view, largest, order)
             else:
-                yield _rendered_window(model, view, order)
-            yield _rendered_window(model, beside[index], order)
+                yield _rendered_window(model, view, largest, order)
+            yield _rendered_window(model, beside[index], largest, order)
 
 
-def _photo_window(model: Model, view: View, order: torch.Generator) -> Window:
+def _photo_window(model: Model, view: View, largest: int, order: torch.Generator) -> Window:
     device = model.device
-    camera, rows, columns = _crop(view.camera, order)
+    camera, rows, columns = _crop(view.camera, largest, order)
     image = view.image[rows, columns].to(device).float() / 255
     exposures = model.exposures if model.options.exposure == "photos" else None
     factors = None if exposures is None else exposures.factors(view.camera.to(device))
@@ -137,14 +141,14 @@ def _photo_window(model: Model, view: View, order: torch.Generator) -> Window:
     return Window(camera, image, factors, None if view.mask is None else view.mask[rows, columns].to(device))
 
 
-def _rendered_window(model: Model, camera: Camera, order: torch.Generator) -> Window:
-    window, _, _ = _crop(camera, order)
+def _rendered_window(model: Model, camera: Camera, largest: int, order: torch.Generator) -> Window:
+    window, _, _ = _crop(camera, largest, order)
     return Window(window, model.render_image(window.to(model.device), exposure="mean").detach())
 
 
-def _crop(camera: Camera, order: torch.Generator) -> tuple[Camera, slice, slice]:
+def _crop(camera: Camera, largest: int, order: torch.Generator) -> tuple[Camera, slice, slice]:
     """Return the camera of a random window of an image, its rows and its columns."""
-    width, height = min(camera.width, WINDOW), min(camera.height, WINDOW)
+    width, height = min(camera.width, largest), min(camera.height, largest)
     left = int(torch.randint(camera.width - width + 1, (1,), generator=order))
     top = int(torch.randint(camera.height - height + 1, (1,), generator=order))
     return camera.crop(left, top, width, height), slice(top, top + height), slice(left, left + width)

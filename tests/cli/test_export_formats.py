@@ -210,6 +210,8 @@ def test_a_gpu_tells_what_the_cpu_tells(finished, tmp_path, kind):
     told = {}
     for device in ("cpu", "cuda"):
         lines: list[str] = []
-        export_run(open_model(finished), ExportOrder(kind, tmp_path / device), device, report=lines.append)
+        export_run(
+            open_model(finished), ExportOrder(kind, tmp_path / device, alpha="blend"), device, report=lines.append
+        )
         told[device] = [float(x) for x in re.findall(r"([\d.]+) dB", lines[-1])]
     assert told["cuda"] == pytest.approx(told["cpu"], abs=0.3)
