@@ -24,6 +24,7 @@ from nexwarp.kernels.surfel import hit
 from nexwarp.kernels.types import ALPHA_MAX, TileLists, types
 from nexwarp.kernels.walk import overflowed, pixel_of, surfel_at, tile_of, walk
 from nexwarp.native.vector_loads import load_record
+from nexwarp.native.warp import any_in_warp, lane_index, warp_sum
 
 LARGEST_COVERAGE = 0.999  # in training: one of 1 would hide what is behind from its gradient
 FARTHEST = 1e30
@@ -207,23 +208,14 @@ def surfel_function(real: type, cut: bool) -> wp.Function:
 
 
 @functools.cache
-def blend_kernel(real: type, cards: bool, cut: bool, backward: bool) -> wp.Kernel:
-    """Make the kernel that blends the hits of the tile's list, or of `nearest`; or its derivative."""
-    t, a, texel = types(real), atlas_types(real), texel_functions(real)
-    vec3, vec4, ZERO, ONE, TRANSMITTANCE_MIN = t.vec3, t.vec4, t.ZERO, t.ONE, t.TRANSMITTANCE_MIN
-    look_up, add, surfel_of, Drawn = look_up_function(real, cards, cut), texel.add, surfel_function(real, cut), a.Drawn
+def blend_kernel(real: type, cards: bool, cut: bool) -> wp.Kernel:
+    """Make the kernel that blends the hits of the tile's list, or of `nearest`."""
+    t, a = types(real), atlas_types(real)
+    vec3, ONE, TRANSMITTANCE_MIN = t.vec3, t.ONE, t.TRANSMITTANCE_MIN
+    look_up, surfel_of, Drawn = look_up_function(real, cards, cut), surfel_function(real, cut), a.Drawn
 
     @wp.kernel(enable_backward=False, grid_stride=False, module="unique")
-    def blend(
-        first: wp.int32,
-        surfels: t.Surfels,
-        lists: TileLists,
-        view: t.View,
-        atlas: a.Atlas,
-        drawn: Drawn,
-        grads: Drawn,
-        sums: a.Sums,
-    ):
+    def blend(first: wp.int32, surfels: t.Surfels, lists: TileLists, view: t.View, atlas: a.Atlas, drawn: Drawn):
         thread = first + wp.tid()
         xy, inside, d = pixel_of(thread, view)
         if not inside:
@@ -235,34 +227,108 @@ def blend_kernel(real: type, cards: bool, cut: bool, backward: bool) -> wp.Kerne
             bounds = wp.vec2i(0, drawn.ids.shape[1])
         transmittance = real(1.0)
         total = vec3()
-        grad = vec3()
-        rest = real(0.0)
-        if wp.static(backward):
-            grad = grads.image[p]
-            rest = wp.dot(grad, drawn.image[p]) + grads.alphas[p] * drawn.alphas[p]
         for k in range(bounds[0], bounds[1]):
             i = surfel_of(k, p, lists, overflow, drawn)
             if i < 0 or transmittance < TRANSMITTANCE_MIN:
                 break
-            color, alpha, slope, _depth, place = look_up(surfels, atlas, i, d, view.near)
-            weight = alpha * transmittance
-            shown = wp.max(color, vec3())
-            total += shown * weight
-            if wp.static(backward) and alpha > ZERO:
-                q = wp.dot(grad, shown) + grads.alphas[p]
-                rest -= q * weight
-                row = vec4()
-                if slope != ZERO:  # a cut-out's coverage is 1, where the quotient is none
-                    row[3] = slope * (transmittance * q - rest / (ONE - alpha))
-                for channel in range(3):
-                    row[channel] = wp.where(color[channel] > ZERO, grad[channel] * weight, ZERO)
-                if wp.static(not cards):
-                    wp.atomic_add(sums.colors, i, row)
-                    row[3] = ZERO
-                add(sums.texels, place, row)
+            color, alpha, _slope, _depth, _place = look_up(surfels, atlas, i, d, view.near)
+            total += wp.max(color, vec3()) * (alpha * transmittance)
             transmittance = transmittance * (ONE - alpha)
-        if wp.static(not backward):
-            drawn.image[p] = total
-            drawn.alphas[p] = ONE - transmittance
+        drawn.image[p] = total
+        drawn.alphas[p] = ONE - transmittance
 
     return blend
+
+
+@functools.cache
+def add_function(real: type, cards: bool) -> wp.Function:
+    """Make the function that adds a hit's gradients, of its colour and, fourth, its alpha's parameter; 0 for no hit.
+
+    The lanes of a warp walk along the same surfels: they add up what belongs to these, before one of them adds it to
+    where thousands of pixels do. All lanes take part. Cards have texels alone.
+    """
+    vec4, ZERO, Sums = types(real).vec4, types(real).ZERO, atlas_types(real).Sums
+    add_texels = texel_functions(real).add
+
+    @wp.func
+    def add_gradients(sums: Sums, i: wp.int32, place: types(real).vec2, hits: wp.bool, hit_grad: vec4):
+        if wp.static(cards):
+            if hits:
+                add_texels(sums.texels, place, hit_grad)
+            return
+        if hits:
+            add_texels(sums.texels, place, vec4(hit_grad[0], hit_grad[1], hit_grad[2], ZERO))
+        if any_in_warp(wp.where(hits, 1, 0)) != 0:
+            total = vec4(warp_sum(hit_grad[0]), warp_sum(hit_grad[1]), warp_sum(hit_grad[2]), warp_sum(hit_grad[3]))
+            if lane_index() == 0:
+                wp.atomic_add(sums.colors, i, total)
+
+    return add_gradients
+
+
+@functools.cache
+def blend_backward_kernel(real: type, cards: bool, cut: bool) -> wp.Kernel:
+    """Make the derivative of `blend_kernel`."""
+    t, a = types(real), atlas_types(real)
+    vec3, vec4, ZERO, ONE, TRANSMITTANCE_MIN = t.vec3, t.vec4, t.ZERO, t.ONE, t.TRANSMITTANCE_MIN
+    look_up, surfel_of, Drawn = look_up_function(real, cards, cut), surfel_function(real, cut), a.Drawn
+    add_gradients = add_function(real, cards)
+
+    @wp.func
+    def gradients_of(color: vec3, alpha: real, slope: real, transmittance: real, grad: vec4, rest: real):
+        """(gradients of a hit's colour and, fourth, of its alpha's parameter; what is left for the hits behind)."""
+        weight = alpha * transmittance
+        shown = wp.max(color, vec3())
+        q = grad[0] * shown[0] + grad[1] * shown[1] + grad[2] * shown[2] + grad[3]
+        rest -= q * weight
+        hit_grad = vec4()
+        if slope != ZERO:  # a cut-out's coverage is 1, where the quotient is none
+            hit_grad[3] = slope * (transmittance * q - rest / (ONE - alpha))
+        for channel in range(3):
+            hit_grad[channel] = wp.where(color[channel] > ZERO, grad[channel] * weight, ZERO)
+        return hit_grad, rest
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module="unique")
+    def blend_backward(
+        first: wp.int32,
+        surfels: t.Surfels,
+        lists: TileLists,
+        view: t.View,
+        atlas: a.Atlas,
+        drawn: Drawn,
+        grads: Drawn,
+        sums: a.Sums,
+    ):
+        thread = first + wp.tid()
+        xy, inside, d = pixel_of(thread, view)
+        p = xy[1] * view.size[0] + xy[0]
+        overflow = overflowed(lists)
+        bounds = walk(tile_of(thread), lists, overflow)
+        if wp.static(cut):
+            bounds = wp.vec2i(0, drawn.ids.shape[1])
+        transmittance = ZERO  # a pixel outside of the image has no hits
+        grad = vec4()
+        rest = ZERO
+        if inside:
+            transmittance = ONE
+            color_grad = grads.image[p]
+            grad = vec4(color_grad[0], color_grad[1], color_grad[2], grads.alphas[p])
+            rest = wp.dot(color_grad, drawn.image[p]) + grad[3] * drawn.alphas[p]
+        for k in range(bounds[0], bounds[1]):
+            going = transmittance >= TRANSMITTANCE_MIN
+            if any_in_warp(wp.where(going, 1, 0)) == 0:
+                break
+            i = int(-1)
+            if inside:  # as is the first lane of a warp that has come here
+                i = surfel_of(k, p, lists, overflow, drawn)
+            alpha = ZERO
+            hit_grad = vec4()
+            place = t.vec2()
+            if going and i >= 0:
+                color, alpha, slope, _depth, place = look_up(surfels, atlas, i, d, view.near)
+                if alpha > ZERO:
+                    hit_grad, rest = gradients_of(color, alpha, slope, transmittance, grad, rest)
+            add_gradients(sums, i, place, alpha > ZERO, hit_grad)
+            transmittance = transmittance * (ONE - alpha)
+
+    return blend_backward

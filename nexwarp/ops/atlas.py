@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.atlas import atlas_types, blend_kernel, nearest_kernel
+from nexwarp.kernels.atlas import atlas_types, blend_backward_kernel, blend_kernel, nearest_kernel
 from nexwarp.kernels.launch import Sharing
 from nexwarp.native.warp import tile_size_on
 from nexwarp.ops._interop import Argument, Context, first_derivative, launch, struct
@@ -47,6 +47,8 @@ def draw_atlas(
     Returns:
         (H, W, 3) colours without background, and (H, W) alpha.
     """
+    if cut is not None and not cards:
+        raise ValueError("cut: expected together with cards, got a cut of surfels, which are blended")
     boxes, rects = places
     tensors = {"records": (projection.records, ("N", 4, 4)), "boxes": (boxes, ("N", 4)), "rects": (rects, ("N", 4))}
     check_tensors(tensors | {"texels": (texels, ("height", "width", 4))})
@@ -75,7 +77,7 @@ class _Draw(torch.autograd.Function):
         drawn = struct(kinds.Drawn, image=image, alphas=alphas, ids=ids)
         if cut is not None:
             scene.launch(nearest_kernel(real, cut.layers), [atlas, drawn])
-        scene.launch(blend_kernel(real, cards, cut is not None, False), [atlas, drawn, drawn, struct(kinds.Sums)])
+        scene.launch(blend_kernel(real, cards, cut is not None), [atlas, drawn])
         ctx.save_for_backward(texels, boxes, rects, ids, image, alphas)
         ctx.rest = (scene, cards, cut)
         return image, alphas
@@ -94,7 +96,7 @@ class _Draw(torch.autograd.Function):
         arguments = [*scene.arguments(), _atlas(real, texels, boxes, rects, cut), drawn, incoming]
         threads = (len(scene.tiles.tile_offsets) - 1) * tile_size_on(records.is_cuda) ** 2
         alone = Sharing(smallest=max(threads, 1))  # neighbouring tiles add to the same texels, on a CPU without atomics
-        launch(records, blend_kernel(real, cards, cut is not None, True), threads, arguments, [sums], sharing=alone)
+        launch(records, blend_backward_kernel(real, cards, cut is not None), threads, arguments, [sums], sharing=alone)
         grad_records = torch.zeros_like(records)
         grad_records[:, 3, :3], grad_records[:, 0, 3] = grad_colors[:, :3], grad_colors[:, 3]
         return grad_records, grad_texels, None, None, None, None, None
