@@ -106,9 +106,10 @@ def evaluate(
 
 def _judge(model: Model, view: View, mask_mode: str, metrics: Sequence[str]) -> tuple[torch.Tensor, Values]:
     """Render a view; return the picture, (H, W, 3) uint8 on the CPU, and its metrics."""
-    picture = to_uint8(model.render_image(view.camera)).cpu()
+    picture = to_uint8(model.render_image(view.camera))
     photo, mask = compared(model, view, mask_mode)
-    return picture, {name: METRICS[name](picture, photo, mask) for name in metrics}
+    photo = photo.to(picture.device)
+    return picture.cpu(), {name: METRICS[name](picture, photo, mask) for name in metrics}
 
 
 def compared(model: Model, view: View, mask_mode: str) -> tuple[torch.Tensor, torch.Tensor | None]:
@@ -151,7 +152,8 @@ def ssim(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = 
     Excluded pixels take the target's values, as windows of included pixels may cover them.
     """
     image, target = _unit_images(image, target, mask)
-    return _included(ssim_map(image, target), mask).mean(dtype=torch.float64).item()
+    with torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False):
+        return _included(ssim_map(image, target), mask).mean(dtype=torch.float64).item()
 
 
 def lpips_vgg(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None = None) -> float | None:
