@@ -22,6 +22,7 @@ FEWEST_STEPS = 400
 MOST_STEPS = {"cuda": 20_000, "cpu": 2000}
 RATES = {"texels": 0.02, "logits": 0.02, "sh0": 5e-3, "shN": 2e-3}
 LAST_RATE = 0.05  # relative to the first
+BETAS, SMALLEST = (0.9, 0.99), 1e-12  # of Adam
 STEEPNESS = 40.0, 400.0  # of the coverage of cut-outs, first and last
 LAYERS = 4
 SATURATED = 250 / 255  # a photo's value from which on it says only how bright the scene is at least
@@ -71,9 +72,8 @@ def fit(
         start |= {"sh0": scene.harmonics[0], "shN": scene.harmonics[1]}
         start["logits"] = torch.logit(scene.shape.opacities, 1e-6)
     trained = {name: x.detach().clone().requires_grad_() for name, x in start.items()}
-    # Moments of a texel or surfel rest while no window shows it: its next step would else be one of the sign alone.
     groups = [{"params": [x], "lr": RATES[name]} for name, x in trained.items() if x.numel()]
-    optimizer = torch.optim.SparseAdam(groups, betas=(0.9, 0.99), eps=1e-12)
+    optimizer = RestingAdam(groups, {})
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, LAST_RATE ** (1 / max(steps, 1)))
     scene = replace(scene, exposures=None)
     for done, window in zip(range(1, steps + 1), _windows(model, views, largest), strict=False):
@@ -85,10 +85,7 @@ def fit(
         loss = errors.mean() if window.mask is None else (errors * window.mask[..., None]).mean()
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        with torch.sparse.check_sparse_tensor_invariants(enable=False):  # without a warning that they are not checked
-            for x in trained.values():
-                _keep_nonzero_rows(x)
-            optimizer.step()
+        optimizer.step()
         schedule.step()
         if scene.harmonics is None:
             with torch.no_grad():
@@ -97,11 +94,30 @@ def fit(
     return _drawn(scene, {name: x.detach() for name, x in trained.items()}, None)
 
 
-def _keep_nonzero_rows(parameter: torch.Tensor) -> None:
-    """Replace a parameter's gradient by a sparse one of the rows that are not 0."""
-    if (grad := parameter.grad) is not None and grad.numel():
-        rows = grad.reshape(len(grad), -1).any(1).nonzero()[:, 0]
-        parameter.grad = torch.sparse_coo_tensor(rows[None], grad[rows], grad.shape, is_coalesced=True)
+class RestingAdam(torch.optim.Optimizer):
+    """Adam whose moments rest, by rows, while the gradient is 0: no window shows the texel or surfel.
+
+    Its next step would else be one of the sign alone. `torch.optim.SparseAdam` does the same, but sorts all rows.
+    """
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # type: ignore[override]  # nothing is evaluated again
+        """Do a step."""
+        for group in self.param_groups:
+            (x,) = group["params"]
+            if x.grad is None:
+                continue
+            state = self.state[x]
+            if not state:
+                state.update(step=0, mean=torch.zeros_like(x), square=torch.zeros_like(x))
+            state["step"] += 1
+            rows = x.grad.reshape(len(x), -1).any(1).nonzero()[:, 0]
+            grad = x.grad[rows]
+            mean = state["mean"][rows].lerp(grad, 1 - BETAS[0])
+            square = state["square"][rows].lerp(grad.square(), 1 - BETAS[1])
+            state["mean"][rows], state["square"][rows] = mean, square
+            first, second = (1 - beta ** state["step"] for beta in BETAS)
+            x[rows] -= group["lr"] / first * mean / ((square / second).sqrt() + SMALLEST)
 
 
 def _drawn(scene: BakedScene, trained: dict[str, torch.Tensor], share: float | None) -> BakedScene:

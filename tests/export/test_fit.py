@@ -10,10 +10,11 @@ import torch
 import nexwarp as nw
 from nexwarp.export.bake import bake, measure
 from nexwarp.export.baked_scene import BakedScene
-from nexwarp.export.fit import fit
+from nexwarp.export.fit import BETAS, SMALLEST, RestingAdam, fit
 from nexwarp.export.glb import bake_cards, make_cards
 from nexwarp.run.evaluate import psnr
 from nexwarp.train.recipe import TextureConfig
+from tests.tolerances import assert_close
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 STEPS = 60
@@ -58,3 +59,18 @@ def test_masked_pixels_do_not_count(model, tiny_scene):
     start = make_cards(measure(model, [view]), "blend")
     texels = [fit(start, model, [dataclasses.replace(view, image=x, mask=mask)], 6).texels for x in images]
     assert torch.equal(*texels) and not torch.equal(texels[0], start.texels)
+
+
+def test_rows_without_gradient_rest_as_in_torch():
+    generator = torch.Generator().manual_seed(0)
+    ours, theirs = (torch.zeros(6, 4, requires_grad=True) for _ in range(2))
+    optimizers = RestingAdam([ours], {"lr": 0.1}), torch.optim.SparseAdam([theirs], 0.1, BETAS, SMALLEST)
+    for _ in range(5):
+        rows = torch.randperm(6, generator=generator)[:3].sort().values
+        values = torch.randn(3, 4, generator=generator)
+        theirs.grad = torch.sparse_coo_tensor(rows[None], values, (6, 4), is_coalesced=True, check_invariants=True)
+        ours.grad = theirs.grad.to_dense()
+        for optimizer in optimizers:
+            optimizer.step()
+    assert ours.detach().abs().sum() > 0.1
+    assert_close(ours.detach(), theirs.detach(), kind="value", name="parameter")
