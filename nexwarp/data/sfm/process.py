@@ -244,10 +244,14 @@ def work() -> None:
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what libraries print is no answer
     order = Order(**json.loads(sys.stdin.readline()))
-    threading.Thread(target=_end_with_parent, args=(Path(order.folder),), daemon=True).start()
+    watch = threading.Thread(target=_end_with_parent, args=(Path(order.folder),), daemon=True)
+    watch.start()
 
     def answer(content: dict[str, object]) -> None:
-        print(json.dumps(content), file=answers, flush=True)
+        try:
+            print(json.dumps(content), file=answers, flush=True)
+        except BrokenPipeError:  # the other process has ended: this one would end, too, before all is deleted
+            watch.join()
 
     try:
         answer({"report": _make(order, lambda *progress: answer({"stage": progress}))})
