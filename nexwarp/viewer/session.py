@@ -202,7 +202,7 @@ class MeasureEditor:
         self.session.client.scene.remove_click_callback(self.clicked)
         if active:
             self.session.client.scene.on_click()(self.clicked)  # type: ignore[arg-type]  # a coroutine
-        self.clicks.clear()
+        self.clicks = deque(maxlen=2)  # another thread may read the old one
         self.points = self.points[:0]
         self.update()
 

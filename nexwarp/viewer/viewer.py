@@ -72,8 +72,9 @@ class Viewer:
             photos: "set/name" -> function that returns the (H, W, 3) uint8 photo, for thumbnails.
             save_path: writes a camera path into the run and returns the command that renders it; None offers none.
             crop_command: returns the command that crops by a sphere, of its centre (3,) and radius; None offers none.
-            figures: "set/name" -> PSNR in dB and sharpness of a photo, the worst first; None or empty lists none.
-            measured: returns lines on one or two points (N, 3), whose true distance is a length; None offers none.
+            figures: "set/name" -> PSNR in dB and sharpness of a photo, the worst first; None lists no photos.
+            measured: returns lines that describe one or two points (N, 3), and the command that makes their distance a
+                given length; None offers no measuring.
         """
         self.model, self.options, self.save_path = model, options, save_path
         self.crop_command, self.measured, self.figures = crop_command, measured, figures or {}
@@ -173,9 +174,9 @@ class Viewer:
             start = time.perf_counter()
             is_first = _kind(session.settings) not in self.pace.seconds_per_pixel
             try:
-                if session.measure is not None and session.measure.clicks:
+                if session.measure is not None and (clicks := session.measure.clicks):
                     session.drawn_at = start
-                    view, place = session.measure.clicks.popleft()
+                    view, place = clicks.popleft()
                     session.measure.add(view, surface_point(self.model(), view, place, self.options.near))
                 elif session.screenshot is not None:
                     self._screenshot(session, session.screenshot)
