@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import monotonic
 from typing import TYPE_CHECKING, cast
 
 import torch
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
 
 CHECKPOINTS_A_RUN = 10
+SECONDS_APART = 30.0  # at least, if nobody asks for more: a checkpoint takes about 1 s on a GPU machine
 
 
 @dataclass
@@ -68,7 +70,7 @@ class Session(StageStore):
     ranks: Ranks
     resume: bool = False
     tensorboard: bool = False  # of the student
-    every: int | None = None  # iterations between checkpoints; None saves ten a stage
+    every: int | None = None  # iterations between checkpoints; None saves at tenths of a stage that are apart enough
     viewer: "Viewer | None" = None
     seconds: float = 0.0  # that complete teachers took
     begun: bool = False
@@ -103,7 +105,7 @@ class Session(StageStore):
         self.begun = True
 
     def train(self, stage: Stage, trainer: Trainer) -> None:
-        """Run the training loop; write checkpoints at regular iterations and after a signal to stop.
+        """Run the training loop; write checkpoints at regular iterations, at the end and after a signal to stop.
 
         Of several ranks, all stop after the step in which the signal of one has reached them. Rank 0 writes.
         """
@@ -111,7 +113,7 @@ class Session(StageStore):
         if stage.teacher and self.ranks.first and not (self.resume and is_run(folder)):
             create_run(folder, RunRecord(self.record.source, stage.config, self.ranks.device.type))
         total = stage.config.iterations
-        every = self.every or max(total // CHECKPOINTS_A_RUN, 1)
+        every, saved = self.every or max(total // CHECKPOINTS_A_RUN, 1), monotonic()
         after = self.work_after(stage, trainer.scene)
         bar = display.training(self.console, total, trainer.iteration, trainer.device, stage.name, after)
         log = TrainingLog(folder, trainer, tensorboard=self.tensorboard and not stage.teacher)
@@ -121,7 +123,11 @@ class Session(StageStore):
                 stack.enter_context(log)
             stop_signal = stack.enter_context(stopped_by_signals(deferred=True))
 
+            def rested() -> bool:  # by the clock of rank 0
+                return self.every is not None or bool(self.ranks.share(monotonic() - saved >= SECONDS_APART))
+
             def observe(step: StepReport) -> None:
+                nonlocal saved
                 if self.ranks.first:
                     show(step)
                     with _model_kept(folder, trainer):
@@ -130,9 +136,10 @@ class Session(StageStore):
                     done = stage.before + step.iteration
                     self.viewer.between_steps(done, partial(_describe, step), lambda: stop_signal() is not None)
                 number = self.ranks.agree(stop_signal(), now=step.iteration == total)
-                if step.passed(every) or step.iteration == total or number is not None:
+                if step.iteration == total or number is not None or (step.passed(every) and rested()):
                     with _model_kept(folder, trainer):
                         trainer.save_checkpoint(folder)
+                    saved = monotonic()
                 if self.ranks.size == 1:
                     number = stop_signal()  # also one that came during the save
                 if number is not None:
@@ -270,9 +277,8 @@ def _model_kept(folder: Path, trainer: Trainer) -> Iterator[None]:
             save_model(folder, trainer.model())
         except OSError:
             model = "the model cannot be saved either"
-        checkpoint = (
-            "--resume continues from the last checkpoint" if has_checkpoint(folder) else "there is no checkpoint"
-        )
+        kept = "--resume continues from the last checkpoint"
+        checkpoint = kept if has_checkpoint(folder) else "there is no checkpoint"
         stop = f"training stops at iteration {trainer.iteration:,}: {model}, {checkpoint}"
         raise StorageError(f"{error}; {stop}") from error
 

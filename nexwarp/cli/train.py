@@ -87,7 +87,7 @@ class Train:
     """Continue the run (docs/resume.md)."""
     overwrite: Flag_ = False
     """Replace the run; files of others stay."""
-    checkpoint_every: Annotated[int | None, option("N", "a tenth of all")] = None
+    checkpoint_every: Annotated[int | None, option("N", "a tenth, over 30 s")] = None
     """Steps between checkpoints."""
     view: Flag_ = False
     """Show the training in the browser (extra viewer)."""

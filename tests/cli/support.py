@@ -14,7 +14,8 @@ from nexwarp.train.recipe import Config
 from tests.trainer_support import OFTEN, TEXTURE
 
 SMALL = Config(texture=TEXTURE, densify=OFTEN)
-FLAGS = ["--iterations", "20", "--max-surfels", "100", "--device", "cpu"]
+SHORT = ["--iterations", "20", "--max-surfels", "100", "--device", "cpu"]  # so short that only its end is saved
+FLAGS = [*SHORT, "--checkpoint-every", "2"]
 RESULTS = {"model.safetensors", "cameras.json", "metrics.json", "metrics.jsonl", "photos.csv", "renders"}
 RUN_FILES = {"config.json", "checkpoint", *RESULTS}
 RUN_FILES |= {"checkpoint.old"}  # where there was more than one

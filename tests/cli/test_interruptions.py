@@ -10,11 +10,12 @@ from typing import Any
 import pytest
 
 from nexwarp.cli import main as cli
+from nexwarp.cli import session
 from nexwarp.run.log import TrainingLog
 from nexwarp.train.densify import DensityControl
 from nexwarp.train.optimizer import FusedAdam
 from nexwarp.train.trainer import Trainer
-from tests.cli.support import FLAGS, RUN_FILES, read, refused, snapshot
+from tests.cli.support import FLAGS, RUN_FILES, SHORT, read, refused, snapshot
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 
@@ -63,7 +64,9 @@ def test_an_interrupted_run_resumes_to_the_same_bits(trained, scene, tmp_path, c
         assert metrics[key] == expected[key], key
 
 
-def test_checkpoints_come_as_often_as_asked_and_two_are_kept(trained, scene, tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def saved(monkeypatch):
+    """Iterations of the checkpoints that are written."""
     seen, save = [], Trainer.save_checkpoint
 
     def note(self, run):
@@ -71,10 +74,33 @@ def test_checkpoints_come_as_often_as_asked_and_two_are_kept(trained, scene, tmp
         save(self, run)
 
     monkeypatch.setattr(Trainer, "save_checkpoint", note)
+    return seen
+
+
+def test_checkpoints_that_nobody_asked_for_are_apart(scene, tmp_path, monkeypatch, saved):
+    """Tenths have 4 steps of 4 s: 30 s are between two, and after a start, but a stop and the end are always saved."""
+    now, step = [0.0], Trainer.step
+
+    def slow_step(self):
+        now[0] += 4.0
+        return step(self)
+
+    monkeypatch.setattr(Trainer, "step", slow_step)
+    monkeypatch.setattr(session, "monotonic", lambda: now[0])
+    command = ["train", str(scene), "--run", str(tmp_path / "run"), *SHORT, "--iterations", "40"]
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt_after(patch, TrainingLog, "__call__", 21, signal.SIGTERM)
+        assert cli.main(command) == 128 + signal.SIGTERM
+    assert saved == [8, 16, 21]
+    assert cli.main([*command, "--resume"]) == 0
+    assert saved == [8, 16, 21, 32, 40]
+
+
+def test_checkpoints_come_as_often_as_asked_and_two_are_kept(trained, scene, tmp_path, capsys, saved):
     run = tmp_path / "run"
     command = ["train", str(scene), "--run", str(run), *FLAGS]
     assert cli.main([*command, "--checkpoint-every", "7"]) == 0
-    assert seen == [7, 14, 20]
+    assert saved == [7, 14, 20]
     kept = [read(run / name, "state.json")["iteration"] for name in ("checkpoint", "checkpoint.old")]
     assert kept == [20, 14]
     assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()

@@ -30,7 +30,7 @@ def run(tmp_path_factory, one_torch_thread: None) -> Path:
     expose_photos(scene)
     changes = ("texture.levels=4", "texture.table_size=1024", "texture.width=16")
     flags = [x for change in changes for x in ("--set", change)]
-    flags += ["--iterations", "5", "--max-surfels", "100", "--device", "cpu"]
+    flags += ["--iterations", "5", "--max-surfels", "100", "--device", "cpu", "--checkpoint-every", "1"]
     assert cli.main(["train", str(scene), "--run", str(folder / "run"), *flags]) == 0
     return folder / "run"
 

@@ -1,7 +1,8 @@
-"""Makes a run with an old version of nexwarp: `python make.py TREE SCENE RUN`, TREE being a checkout of that version.
+"""Makes a run with an old version of nexwarp: `python make.py TREE SCENE RUN [OPTION...]`, TREE being its checkout.
 
 The run is tiny: 24 surfels, 6 iterations, a texture of 2 levels. Of its checkpoints the one before the last is kept, so
-that a resumed training has a step to do. `picture.npy` is the old version's rendering of the first test view, float32.
+that a resumed training has a step to do; since 2026-11-29 that needs the option `--checkpoint-every 1`. `picture.npy`
+is the old version's rendering of the first test view, float32.
 """
 
 import importlib
@@ -20,7 +21,7 @@ def first_of(tree: str, *names: str) -> Any:
     return importlib.import_module(next(x for x in names if Path(tree, f"{x.replace('.', '/')}.py").is_file()))
 
 
-def main(tree: str, scene: str, run: str) -> None:
+def main(tree: str, scene: str, run: str, *options: str) -> None:
     sys.path.insert(0, tree)
     torch.set_num_threads(1)
     config = first_of(tree, "nexwarp.train.recipe", "nexwarp.train.config", "nexwarp.config", "nexwarp.trainer")
@@ -38,7 +39,7 @@ def main(tree: str, scene: str, run: str) -> None:
 
     evaluate.to_uint8 = record
     flags = ["--iterations", "6", "--max-surfels", "24", "--device", "cpu"]
-    assert cli.main(["train", scene, "--run", run, *flags]) == 0
+    assert cli.main(["train", scene, "--run", run, *flags, *options]) == 0
     folder = Path(run)
     np.save(folder / "picture.npy", pictures[0].numpy().astype(np.float32))
     shutil.rmtree(folder / "renders")

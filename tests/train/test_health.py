@@ -133,7 +133,7 @@ def test_nothing_that_is_not_finite_is_ever_saved(scene, tmp_path, monkeypatch):
 def test_the_command_line_names_the_fault_and_keeps_the_checkpoint(folder, tmp_path, monkeypatch, capsys):
     run = tmp_path / "run"
     inject(monkeypatch, {22}, poison("gradient surfels.means"))
-    assert cli.main(["train", str(folder), "--run", str(run), *FLAGS]) == 2
+    assert cli.main(["train", str(folder), "--run", str(run), *FLAGS, "--checkpoint-every", "4"]) == 2
     err = capsys.readouterr().err
     assert err.startswith("nexwarp: error: iteration 2") and err.count("\n") == 1
     assert err.endswith("; the last checkpoint stays\n")

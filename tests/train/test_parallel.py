@@ -1,6 +1,8 @@
 """Several ranks train one model: on CPUs, over gloo, in 2 and 3 processes."""
 
 import dataclasses
+import itertools
+import json
 import os
 import signal
 import time
@@ -12,6 +14,7 @@ import safetensors.torch
 import torch
 
 from nexwarp.cli import main as cli
+from nexwarp.cli import session
 from nexwarp.data import Scene
 from nexwarp.errors import RankError, SceneError, SettingError
 from nexwarp.machine import derived_seed
@@ -45,7 +48,8 @@ pytestmark = pytest.mark.usefixtures("one_torch_thread")
 # The command line has no flags for the texture's shape. All ranks estimate exposures alike, and that would take most of
 # the time of so short a training.
 SMALL = Config(exposures=False, texture=TEXTURE, densify=OFTEN)
-TRAIN = ["--iterations", "24", "--max-surfels", "100", "--device", "cpu", "--checkpoint-every", "2"]
+TRAIN = ["--iterations", "24", "--max-surfels", "100", "--device", "cpu"]
+OFTEN_SAVED = [*TRAIN, "--checkpoint-every", "2"]
 
 
 def long_config(size: int, steps: int) -> Config:
@@ -223,9 +227,9 @@ def test_a_killed_rank_ends_all_and_the_run_resumes(tiny_folder: Path, tmp_path:
         return ["train", str(tiny_folder), "--run", str(run), *more]
 
     whole, run = tmp_path / "whole", tmp_path / "run"
-    assert wait(start_ranks(2, lambda _: cli.main(train(whole, *TRAIN)), tmp_path / "a")) == [0, 0]
+    assert wait(start_ranks(2, lambda _: cli.main(train(whole, *OFTEN_SAVED)), tmp_path / "a")) == [0, 0]
     assert printed(tmp_path / "a") == [] and len(printed(tmp_path / "a", "out")) > 5
-    processes = start_ranks(2, lambda _: cli.main(train(run, *TRAIN)), tmp_path / "b")
+    processes = start_ranks(2, lambda _: cli.main(train(run, *OFTEN_SAVED)), tmp_path / "b")
     until = time.monotonic() + 60
     while not has_checkpoint(run) and time.monotonic() < until:
         time.sleep(0.005)
@@ -241,6 +245,28 @@ def test_a_killed_rank_ends_all_and_the_run_resumes(tiny_folder: Path, tmp_path:
     resumed = start_ranks(2, lambda _: cli.main(train(run, "--device", "cpu", "--resume")), tmp_path / "c")
     assert wait(resumed) == [0, 0] and printed(tmp_path / "c") == []
     assert (run / MODEL_FILE).read_bytes() == (whole / MODEL_FILE).read_bytes()
+
+
+def test_ranks_save_by_the_clock_of_the_first(tiny_folder: Path, tmp_path: Path, small_default: None) -> None:
+    """Looking at the clock takes 20 s on it: the tenths that it saves are every second one. The other's is faster."""
+
+    def work(rank: int) -> int:
+        saved: list[int] = []
+        save = Trainer.save_checkpoint
+
+        def note(trainer: Trainer, run: Path) -> None:
+            saved.append(trainer.iteration)
+            (tmp_path / f"{rank}.json").write_text(json.dumps(saved))
+            save(trainer, run)
+
+        patch = pytest.MonkeyPatch()  # of a process that ends
+        patch.setattr(Trainer, "save_checkpoint", note)
+        patch.setattr(session, "monotonic", itertools.count(step=(20, 1000)[rank]).__next__)
+        return cli.main(["train", str(tiny_folder), "--run", str(tmp_path / "run"), *TRAIN])
+
+    assert wait(start_ranks(2, work, tmp_path / "ranks")) == [0, 0], printed(tmp_path / "ranks")
+    saved = [json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2)]
+    assert saved == [[4, 8, 12, 16, 20, 24]] * 2
 
 
 def test_many_gradients_are_summed_after_the_graph() -> None:

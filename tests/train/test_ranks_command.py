@@ -107,6 +107,7 @@ def test_ranks_train_teachers_first(tiny_folder: Path, tmp_path: Path) -> None:
     """And find them again, on all ranks, when the run is resumed."""
     run = tmp_path / "run"
     command = ["train", str(tiny_folder), "--run", str(run), *TRAIN, "--gpus", "2", "--iterations", "40"]
+    command += ["--checkpoint-every", "4"]
     process = start([*command, "--set", "teachers=2"])
     assert lines(process) == [] and process.returncode == 0
     model, metrics = (run / MODEL_FILE).read_bytes(), json.loads((run / "metrics.json").read_text())
