@@ -247,21 +247,28 @@ def add_function(real: type, cards: bool) -> wp.Function:
     The lanes of a warp walk along the same surfels: they add up what belongs to these, before one of them adds it to
     where thousands of pixels do. All lanes take part. Cards have texels alone.
     """
-    vec4, ZERO, Sums = types(real).vec4, types(real).ZERO, atlas_types(real).Sums
+    t, a = types(real), atlas_types(real)
+    vec2, vec4, ZERO = t.vec2, t.vec4, t.ZERO
     add_texels = texel_functions(real).add
 
     @wp.func
-    def add_gradients(sums: Sums, i: wp.int32, place: types(real).vec2, hits: wp.bool, hit_grad: vec4):
+    def add_gradients(sums: a.Sums, atlas: a.Atlas, i: wp.int32, place: vec2, hits: wp.bool, hit_grad: vec4):
         if wp.static(cards):
             if hits:
                 add_texels(sums.texels, place, hit_grad)
             return
-        if hits:
+        if any_in_warp(wp.where(hits, 1, 0)) == 0:
+            return
+        total = vec4(warp_sum(hit_grad[0]), warp_sum(hit_grad[1]), warp_sum(hit_grad[2]), warp_sum(hit_grad[3]))
+        first = lane_index() == 0
+        if first:
+            wp.atomic_add(sums.colors, i, total)
+        rect = atlas.rects[i]
+        if rect[2] == ZERO and rect[3] == ZERO:  # one texel for all pixels, the atlas' first for untextured surfels
+            if first:
+                add_texels(sums.texels, vec2(rect[0], rect[1]), vec4(total[0], total[1], total[2], ZERO))
+        elif hits:
             add_texels(sums.texels, place, vec4(hit_grad[0], hit_grad[1], hit_grad[2], ZERO))
-        if any_in_warp(wp.where(hits, 1, 0)) != 0:
-            total = vec4(warp_sum(hit_grad[0]), warp_sum(hit_grad[1]), warp_sum(hit_grad[2]), warp_sum(hit_grad[3]))
-            if lane_index() == 0:
-                wp.atomic_add(sums.colors, i, total)
 
     return add_gradients
 
@@ -328,7 +335,7 @@ def blend_backward_kernel(real: type, cards: bool, cut: bool) -> wp.Kernel:
                 color, alpha, slope, _depth, place = look_up(surfels, atlas, i, d, view.near)
                 if alpha > ZERO:
                     hit_grad, rest = gradients_of(color, alpha, slope, transmittance, grad, rest)
-            add_gradients(sums, i, place, alpha > ZERO, hit_grad)
+            add_gradients(sums, atlas, i, place, alpha > ZERO, hit_grad)
             transmittance = transmittance * (ONE - alpha)
 
     return blend_backward

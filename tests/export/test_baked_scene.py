@@ -97,7 +97,7 @@ def by_definition(scene: BakedScene, camera: nw.Camera) -> torch.Tensor:
 
 
 def random_baked(form: str, count: int = 9) -> tuple[BakedScene, nw.Camera]:
-    """A scene in float64 with random texels of 5 x 4, and a camera."""
+    """A scene in float64 with random texels of 5 x 4, of one surfel with one texel, and a camera."""
     raw = random_scene(count, width=37, height=27, dtype=torch.float64)
     surfels, camera = make_surfels(raw), make_camera(raw)
     camera = dataclasses.replace(camera, viewmat=camera.viewmat.detach())
@@ -110,6 +110,7 @@ def random_baked(form: str, count: int = 9) -> tuple[BakedScene, nw.Camera]:
     background = (0.2, 0.5, 0.1)
     if form == "surfels":
         boxes = boxes * torch.rand(count, 4, generator=generator, dtype=torch.float64).add(0.5)
+        rects[count // 2, 2:] = 0
         harmonics = (surfels.sh0.detach().clone(), surfels.shN.detach().clone())
         return BakedScene(shape, texels - 0.5, boxes, rects, harmonics, background=background), camera
     shape = shape._replace(opacities=torch.ones_like(shape.opacities), gammas=torch.full_like(shape.gammas, 1000.0))
