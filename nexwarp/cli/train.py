@@ -38,7 +38,7 @@ from nexwarp.run.log import check_tensorboard
 from nexwarp.train.initial import Start, check_start
 from nexwarp.train.ranks.ranks import Ranks, check_count, is_rank
 from nexwarp.train.recipe import DEMO_SETTINGS, Config, parse_settings, preset, setting, with_settings
-from nexwarp.train.stages import NO_TEACHERS, StageRunner, plan_teachers
+from nexwarp.train.stages import NO_TEACHERS, StageRunner, plan_teachers, shortened
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
@@ -69,7 +69,7 @@ class Train:
     init: Annotated[Path | None, option("FILE|RUN", "the points")] = None
     """Start from surfels of a .ply, or from a run."""
     preset: Preset_ = "default"
-    """Start from default, web or paper."""
+    """Start from fast, web or paper."""
     settings: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(name="set", metavar="KEY=VALUE", help_behavior_hint="(repeatable)"),
@@ -87,8 +87,8 @@ class Train:
     """Continue the run (docs/resume.md)."""
     overwrite: Flag_ = False
     """Replace the run; files of others stay."""
-    checkpoint_every: Annotated[int | None, option("N", "a tenth, over 30 s")] = None
-    """Steps between checkpoints."""
+    checkpoint_every: Annotated[int | None, option("N", "a tenth, 30 s apart")] = None
+    """Save every N steps."""
     view: Flag_ = False
     """Show the training in the browser (extra viewer)."""
     host: Host_ = "127.0.0.1"
@@ -134,6 +134,7 @@ class Train:
                         expected = "expected --background instead, which also applies to the photos"
                         raise SettingError(f"--set: background: {expected}")
                     config = dataclasses.replace(config, background=scene.background)
+                config = shortened(config, len(scene.train))
                 own = NO_TEACHERS if teachers else plan_teachers(config, len(scene.train))
                 record = dataclasses.replace(record, config=config, own=own)
             session = Session(
@@ -208,6 +209,8 @@ class Train:
         base = preset(self.preset)
         if self.scene.path == DEMO:
             base = with_settings(base, DEMO_SETTINGS)
+        if self.iterations is not None:
+            base = dataclasses.replace(base, steps_a_photo=None)
         base = with_settings(base, flags)
         with _naming("--set"):
             return with_settings(base, settings)

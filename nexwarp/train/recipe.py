@@ -193,6 +193,8 @@ class DensifyConfig:
 class Recipe:
     """How a training goes about it: what few people change."""
 
+    steps_a_photo: int | None = None
+    """Training steps for each training photo at most: shortens `iterations` where photos are few, to 7,000 at least."""
     more_hits_from: int = 25_000
     """With K > 2: the iteration, of a run of 30,000, from which more than 2 hits are textured. Geometry that converges
     with K = 2 has fewer floaters."""
@@ -220,6 +222,7 @@ class Recipe:
 
     def __post_init__(self) -> None:
         _check_types(self)
+        check_range("steps_a_photo", 1 if self.steps_a_photo is None else self.steps_a_photo, 1)
         check_range("more_hits_from", self.more_hits_from, 0)
         check_range("sh_every", self.sh_every, 1)
         check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)
@@ -317,6 +320,9 @@ USER_SETTINGS = (*Config.__annotations__, "losses.depth", "losses.normals", "tex
 
 DEFAULT = Config()
 
+# Captures of up to 130 photos in less time.
+FAST = Config(preset="fast", steps_a_photo=230, teachers=0)
+
 # A texture that weak GPUs evaluate in real time: a third of the arithmetic.
 WEB = Config(preset="web", texture=TextureConfig(width=32, hidden_layers=1, sh_degree=1))
 
@@ -360,7 +366,7 @@ DEMO_SETTINGS: dict[str, object] = {
     "rates.mlp": (3e-3, 3e-4),
 }
 
-PRESETS = {config.preset: config for config in (DEFAULT, WEB, PAPER)}
+PRESETS = {config.preset: config for config in (DEFAULT, FAST, WEB, PAPER)}
 
 
 def preset(name: str) -> Config:

@@ -29,6 +29,7 @@ from nexwarp.train.trainer import Trainer
 TEACHERS = 2
 MOST_PHOTOS = 44
 SURFELS_A_PHOTO = 300
+SHORTEST = 7000  # iterations of a run that is shortened to its photos
 SHARE = 0.4  # of the iterations that the teachers have together
 # Teachers of a small student have more surfels than it: one of 10,000 gained more PSNR and SSIM from teachers of 40,000
 # than from those of 10,000, on all four folds that were tried.
@@ -78,6 +79,14 @@ class Stage:
         """Return what the training and the finishing of its model cost, in training steps."""
         passes = (self.config.smooth_sh > 0) + self.config.footprints
         return self.config.iterations + VIEW_COST * passes * photos
+
+
+def shortened(config: Config, photos: int) -> Config:
+    """Return settings with the iterations that so many training photos need; see `Recipe.steps_a_photo`."""
+    if config.steps_a_photo is None:
+        return config
+    most = max(config.steps_a_photo * photos, SHORTEST)
+    return dataclasses.replace(config, iterations=min(config.iterations, most))
 
 
 def plan_teachers(config: Config, photos: int) -> OwnTeachers:
@@ -158,13 +167,15 @@ class StageRunner:
     ) -> None:
         """Make the trainer of the first stage that is not complete; no step is done yet.
 
-        `own` are the teachers that the run trains: None plans them, or none where `teachers`, models, are given
-        instead. `extensions` are the `losses` of `nexwarp.train`, and what the student starts from.
+        `own` are the teachers that the run trains: None shortens the run where its settings say so and plans them, or
+        none where `teachers`, models, are given instead. `extensions` are the `losses` of `nexwarp.train`, and what
+        the student starts from.
         """
         self.scene, self.device, self.store, self.ranks, self.extensions = scene, device, store, ranks, extensions
         # `Trainer` says what is wrong with it.
         self.teachers: Any = teachers if isinstance(teachers, Model) else list(teachers)
         if own is None:
+            config = shortened(config, len(scene.train))
             own = NO_TEACHERS if self.teachers else plan_teachers(config, len(scene.train))
         self.calibration = cache(lambda: calibrate_exposures(scene, config))
         self.stages = divide(config, own)

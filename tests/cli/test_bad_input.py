@@ -31,7 +31,7 @@ def refuses(tmp_path, capsys) -> Callable[..., None]:
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        (["--preset", "papr"], ["preset", "expected one of default, paper", "'papr'"]),
+        (["--preset", "papr"], ["preset", "expected one of default, fast, paper", "'papr'"]),
         (["--max-hits", "9"], ["max-hits", "expected 0 to 8", "got 9"]),
         (["--downscale", "37"], ["downscale", "expected at most", "got 37"]),
         (["--device", "gpu"], ["--device", "expected cuda or cpu", "'gpu'"]),

@@ -19,12 +19,13 @@ from nexwarp.cli.session import Session
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import SettingError
 from nexwarp.run.folder import RunRecord, create_run, list_files, read_run
+from nexwarp.train import stages
 from nexwarp.train import trainer as trainer_module
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import TextureConfig
 from nexwarp.train.report import StepReport
-from nexwarp.train.stages import VIEW_COST, OwnTeachers, StageRunner, divide, plan_teachers
+from nexwarp.train.stages import VIEW_COST, OwnTeachers, StageRunner, divide, plan_teachers, shortened
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -45,6 +46,22 @@ def same(one: Model, other: Model) -> bool:
 def settings_of(config: Config, own: OwnTeachers) -> list[Config]:
     """The settings of a run's stages, the student's last."""
     return [stage.config for stage in divide(config, own)]
+
+
+@pytest.mark.parametrize(
+    ("preset", "changes", "photos", "iterations"),
+    [
+        ("default", {}, 43, 30_000),
+        ("fast", {}, 43, 9890),
+        ("fast", {}, 21, 7000),  # the shortest
+        ("fast", {}, 263, 30_000),  # never longer
+        ("fast", {"iterations": 700}, 43, 700),
+        ("fast", {"steps_a_photo": 300}, 43, 12_900),
+    ],
+)
+def test_a_fast_run_has_the_iterations_that_its_photos_need(preset, changes, photos, iterations):
+    config = dataclasses.replace(nw.preset(preset), **changes)
+    assert shortened(config, photos) == dataclasses.replace(config, iterations=iterations)
 
 
 @pytest.mark.parametrize(
@@ -147,6 +164,27 @@ def model_of(run: Path) -> bytes:
 def test_the_command_does_what_train_does(finished: Path, tiny_scene: Scene, tmp_path: Path) -> None:
     expected = nw.train(tiny_scene, CONFIG, device=CPU)
     assert same(nw.load(finished), nw.load(expected.save(tmp_path)))
+
+
+def test_fast_runs_are_shortened_in_python_and_by_the_command(
+    tiny_folder: Path, tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stages, "SHORTEST", 1)
+    photos = len(tiny_scene.train)
+    assert photos < CONFIG.iterations
+    steps: list[StepReport] = []
+    config = dataclasses.replace(CONFIG, steps_a_photo=1, teachers=0)
+    nw.train(tiny_scene, config, device=CPU, callbacks=[steps.append])
+    assert len(steps) == photos
+    run = tmp_path / "run"
+    command = ["train", str(tiny_folder), "--run", str(run), "--preset", "fast", *SMALL]
+    for asked in (["--set", "steps_a_photo=1"], ["--set", "steps_a_photo=1", "--resume"]):
+        assert cli.main([*command, *asked]) == 0
+        assert read_run(run).config.iterations == photos
+    # Iterations that were typed are those of the run.
+    for asked in (["--overwrite"], ["--resume"]):
+        assert cli.main([*command, "--iterations", "20", *asked]) == 0
+        assert read_run(run).config.iterations == 20
 
 
 def test_a_teacher_is_a_run(run: Path) -> None:
