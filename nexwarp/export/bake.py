@@ -32,6 +32,7 @@ FILLED = 0.85  # fraction of the atlas that rectangles cover at most: packing le
 BISECTIONS = 24
 TEXELS_AT_A_TIME = 2**20
 LARGEST_TEXEL = 1e6  # pixels
+UNCLIPPED = 0.98  # of the colours that 8 bits are to hold
 GROWTH = 1.2
 
 Progress = Callable[[str, int, int], None]  # name of a stage, how much of it is done, and of how much
@@ -165,6 +166,17 @@ def points_on(surfels: Surfels | Activated, ids: torch.Tensor, offsets: torch.Te
     """Return points (..., 3), world frame, at offsets (..., 2) [world units] along the axes of surfels (...)."""
     ways = zip(offsets.unbind(-1), axes(surfels), strict=True)
     return surfels.means.detach()[ids] + sum(x[..., None] * axis[ids] for x, axis in ways)
+
+
+def dimmed(model: Model, colors: torch.Tensor) -> float:
+    """Return by what to multiply colours (N, 3) at the mean exposure so that hardly any are clipped; at most 1.
+
+    1 where the model has no exposures: photos of one exposure show what is brighter than 1 as clipped, too.
+    """
+    if model.exposures is None or model.options.exposure != "photos" or not len(colors):
+        return 1.0
+    brightest = colors.amax(1)
+    return 1.0 / max(float(brightest.sort().values[int(UNCLIPPED * (len(brightest) - 1))]), 1.0)
 
 
 def untextured(model: Model, surfels: Surfels | None = None) -> Model:

@@ -52,6 +52,7 @@ class BakedScene:
         limits: beyond which surfels are blurred; None blurs none.
         exposures: exposures of the photos; None is the mean one.
         background: colour behind the surfels; black for a glTF file, which has none.
+        exposure: of cards: by what their colours were multiplied, from the photos' mean exposure, so as not to clip.
         cut: of cards that are cut out, and tested for depth; None blends.
     """
 
@@ -63,6 +64,7 @@ class BakedScene:
     limits: DetailLimits | None = None
     exposures: Exposures | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    exposure: float = 1.0
     cut: Cut | None = None
 
     def to(self, device: torch.device | str) -> "BakedScene":
@@ -106,6 +108,11 @@ class BakedScene:
         color = color_tensor(self.background if background is None else background, image, 3)
         image = image + (1 - alpha)[..., None] * color
         return image if self.exposures is None else image * self.exposures.factors(camera)
+
+    def render_at_mean(self, camera: Camera, background: tuple[float, float, float]) -> torch.Tensor:
+        """Render a scene without exposures at the photos' mean exposure, as is the background."""
+        dimmed = tuple(self.exposure * x for x in background)
+        return self.render(camera, background=dimmed) / self.exposure
 
     @torch.no_grad()
     def overdraw(self, camera: Camera) -> float:
@@ -309,7 +316,11 @@ def _read_cards(content: bytes) -> BakedScene:
     if cut is not None:
         check_range("alphaCutoff", cut.cutoff, 0.0, 1.0)
     geometry = (corners.mean(1), quats, sizes.float())
-    return card_scene(geometry, picture.float() / 255, torch.cat([first_place, last], dim=1), cut)
+    extras = tree["asset"].get("extras")
+    exposure = float(extras.get("exposure", 1.0)) if isinstance(extras, dict) else 1.0
+    check_range("exposure", exposure, 1e-6, 1.0)
+    cards = card_scene(geometry, picture.float() / 255, torch.cat([first_place, last], dim=1), cut)
+    return dataclasses.replace(cards, exposure=exposure)
 
 
 def _view(tree: Header, binary: bytes, index: int) -> bytes:

@@ -38,12 +38,16 @@ def cameras_of(views: Views) -> list[Camera]:
 
 @dataclass(frozen=True)
 class Window:
-    """A part of a view to be drawn: its camera, the image (H, W, 3), its exposure, and which pixels count."""
+    """A part of a view to be drawn: its camera, the image (H, W, 3), its exposure, which pixels count.
+
+    `clipped` is a photo, in which what is bright may be brighter.
+    """
 
     camera: Camera
     image: torch.Tensor
     factors: torch.Tensor | None = None
     mask: torch.Tensor | None = None
+    clipped: bool = False
 
 
 def fit(
@@ -77,10 +81,12 @@ def fit(
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, LAST_RATE ** (1 / max(steps, 1)))
     scene = replace(scene, exposures=None)
     for done, window in zip(range(1, steps + 1), _windows(model, views, largest), strict=False):
-        image = _drawn(scene, trained, done / steps).render(window.camera, background=model.options.background)
+        shown = _drawn(scene, trained, done / steps)
+        image = shown.render_at_mean(window.camera, model.options.background)
         if window.factors is not None:
             image = image * window.factors
-        image = image.where((window.image < SATURATED) | (image < window.image), window.image)
+        if window.clipped:
+            image = image.where((window.image < SATURATED) | (image < window.image), window.image)
         errors = (image - window.image).square()
         loss = errors.mean() if window.mask is None else (errors * window.mask[..., None]).mean()
         optimizer.zero_grad(set_to_none=True)
@@ -154,7 +160,8 @@ def _photo_window(model: Model, view: View, largest: int, order: torch.Generator
     factors = None if exposures is None else exposures.factors(view.camera.to(device))
     if factors is not None and factors.ndim == 3:
         factors = factors[rows, columns]
-    return Window(camera, image, factors, None if view.mask is None else view.mask[rows, columns].to(device))
+    mask = None if view.mask is None else view.mask[rows, columns].to(device)
+    return Window(camera, image, factors, mask, clipped=True)
 
 
 def _rendered_window(model: Model, camera: Camera, largest: int, order: torch.Generator) -> Window:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.similarity import upright
 from nexwarp.errors import FormatError
-from nexwarp.export.bake import Baked, Progress, lay_out, measure, points_on
+from nexwarp.export.bake import Baked, Progress, dimmed, lay_out, measure, points_on
 from nexwarp.export.baked_scene import BakedScene, Header, card_scene
 from nexwarp.export.fit import Views, fit
 from nexwarp.io.files import write_atomically
@@ -42,7 +43,8 @@ def bake_cards(
 def make_cards(baked: Baked, alpha: str = "mask") -> BakedScene:
     """Return a baked scene as cards, for `save_glb`: cut out ("mask") or blended ("blend").
 
-    Colours are those at the mean exposure from the direction in which the views see each surfel.
+    Colours are those from the direction in which the views see each surfel, at the photos' mean exposure or a darker
+    one: where photos differ much in exposure, half of a sunny scene would be clipped at the mean.
     """
     surfels = baked.surfels
     least = LEAST_ALPHA[alpha] * CUTOFF
@@ -57,17 +59,16 @@ def make_cards(baked: Baked, alpha: str = "mask") -> BakedScene:
         colors = plain[ids] + baked.added(ids, local)
         exponent = local.square().clamp_min(1e-20).pow(gammas[ids]).sum(1)
         alphas = (surfels.opacities[ids] * torch.exp(-0.5 * exponent)).clamp(max=ALPHA_MAX)
-        texels[places[:, 1], places[:, 0]] = torch.cat([colors.clamp(0, 1), alphas[:, None]], dim=1)
+        texels[places[:, 1], places[:, 0]] = torch.cat([colors, alphas[:, None]], dim=1)
+    exposure = dimmed(baked.model, texels[..., :3][texels[..., 3] >= least])
+    texels[..., :3] = (texels[..., :3] * exposure).clamp(0, 1)
     ids = layout.textured()
     rects = layout.rects[ids].float()
     scales = surfels.scales[ids] * reach[ids]
     cut = Cut(CUTOFF) if alpha == "mask" else None
-    return card_scene(
-        (surfels.means[ids], surfels.quats[ids], scales),
-        texels,
-        torch.cat([rects[:, :2], rects[:, 2:] - 1], dim=1),
-        cut,
-    )
+    geometry = (surfels.means[ids], surfels.quats[ids], scales)
+    cards = card_scene(geometry, texels, torch.cat([rects[:, :2], rects[:, 2:] - 1], dim=1), cut)
+    return replace(cards, exposure=exposure)
 
 
 @torch.no_grad()
@@ -99,7 +100,7 @@ def save_glb(path: str | os.PathLike[str], scene: BakedScene, cameras: Sequence[
     turn[:3, :3] = upright(cameras)
     world = trimesh.Scene()
     world.add_geometry(mesh, transform=turn)
-    write_atomically(Path(path), export_glb(world, tree_postprocessor=_unlit))
+    write_atomically(Path(path), export_glb(world, tree_postprocessor=partial(_unlit, exposure=scene.exposure)))
 
 
 def quads(scene: BakedScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -116,8 +117,9 @@ def quads(scene: BakedScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return corners.reshape(-1, 3).double().cpu().numpy(), places.reshape(-1, 2).cpu().numpy(), faces
 
 
-def _unlit(tree: Header) -> None:
-    """Make the material show its texture as it is, without light and without coarser levels of the texture."""
+def _unlit(tree: Header, exposure: float) -> None:
+    """Make the material show its texture as it is, without light and without coarser levels; note its exposure."""
+    tree["asset"]["extras"] = {"exposure": exposure}
     for material in tree["materials"]:
         material["extensions"] = {"KHR_materials_unlit": {}}
     tree["extensionsUsed"] = ["KHR_materials_unlit"]

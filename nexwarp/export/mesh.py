@@ -2,8 +2,9 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from statistics import median
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.similarity import Similarity
 from nexwarp.errors import RunError, SettingError
-from nexwarp.export.bake import Progress
+from nexwarp.export.bake import Progress, dimmed
 from nexwarp.io.ply import write_elements
 from nexwarp.kernels.tsdf import BLOCK_SIDE
 from nexwarp.model.model import Model
@@ -89,7 +90,7 @@ def extract_mesh(
     for done, camera in enumerate(cameras, 1):
         field.fuse(camera, *_depths(model, camera, far))
         observe("fusing depths", done, len(cameras))
-    mesh = _without_crumbs(_surface(field, observe))
+    mesh = _without_crumbs(_surface(field, partial(dimmed, model), observe))
     if not len(mesh.triangles):
         raise RunError("mesh: expected a surface that two training cameras see, found none; give a larger --voxel")
     return mesh
@@ -99,11 +100,14 @@ def _depths(model: Model, camera: Camera, far: float) -> tuple[torch.Tensor, tor
     """Return z-depths (H, W), 0 where there is no surface, and colours (H, W, 3) at the photos' mean exposure."""
     out = model.render(camera, exposure="mean")
     depths = out.median_depth
-    return depths.where((out.alpha > LEAST_ALPHA) & (depths < far), 0.0), out.image.clamp(0, 1)
+    return depths.where((out.alpha > LEAST_ALPHA) & (depths < far), 0.0), out.image.clamp_min(0)
 
 
-def _surface(field: DistanceField, observe: Progress) -> Mesh:
-    """Return the zero level of a distance field where all corners of a cell are known; marching cubes by blocks."""
+def _surface(field: DistanceField, dimming: Callable[[torch.Tensor], float], observe: Progress) -> Mesh:
+    """Return the zero level of a distance field where all corners of a cell are known; marching cubes by blocks.
+
+    `dimming` returns by what to multiply the vertices' colours.
+    """
     from scipy.ndimage import map_coordinates
     from skimage.measure import marching_cubes
 
@@ -140,7 +144,7 @@ def _surface(field: DistanceField, observe: Progress) -> Mesh:
     return Mesh(
         (vertices[first] * field.voxel).astype(np.float32),
         normals[first].astype(np.float32),
-        np.clip(np.round(shades[first] * 255), 0, 255).astype(np.uint8),
+        np.clip(np.round(shades[first] * (255 * dimming(torch.from_numpy(shades[first])))), 0, 255).astype(np.uint8),
         triangles[whole].astype(np.int32),
     )
 

@@ -18,6 +18,7 @@ from nexwarp.export.mesh import Mesh
 from nexwarp.export.splats import gaussians
 from nexwarp.io.files import write_atomically
 from nexwarp.io.pictures import to_uint8
+from nexwarp.kernels.sh import BAND_0
 from nexwarp.model.surfels import Surfels
 
 if TYPE_CHECKING:
@@ -54,10 +55,11 @@ def save_usdz(
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         root = UsdGeom.Xform.Define(stage, ROOT)
         stage.SetDefaultPrim(root.GetPrim())
+        stage.SetMetadata("customLayerData", {"exposure": scene.exposure})
         turn = np.eye(4)
         turn[:3, :3] = upright(cameras)
         root.AddTransformOp().Set(Gf.Matrix4d(turn.T.tolist()))  # of row vectors
-        forms = {"cards": _cards(stage, scene), "surfels": _particles(stage, surfels, sh_degree)}
+        forms = {"cards": _cards(stage, scene), "surfels": _particles(stage, surfels, sh_degree, scene.exposure)}
         if collision is not None:
             _collider(stage, collision)
         choice = root.GetPrim().GetVariantSets().AddVariantSet(VARIANTS)
@@ -140,8 +142,8 @@ def _mesh(stage: "Usd.Stage", name: str, points: np.ndarray, faces: np.ndarray) 
     return mesh
 
 
-def _particles(stage: "Usd.Stage", surfels: Surfels, sh_degree: int) -> "UsdGeom.Gprim":
-    """Define the particle field of the surfels."""
+def _particles(stage: "Usd.Stage", surfels: Surfels, sh_degree: int, exposure: float) -> "UsdGeom.Gprim":
+    """Define the particle field of the surfels, dimmed as the cards are."""
     from pxr import UsdVol, Vt
 
     found = gaussians(surfels, sh_degree, (), float("inf"))  # surflets are exact at any size
@@ -149,6 +151,8 @@ def _particles(stage: "Usd.Stage", surfels: Surfels, sh_degree: int) -> "UsdGeom
         x.float().cpu().numpy()
         for x in (found.means, found.quats.roll(-1, 1), found.log_scales.exp(), found.sh[:, : (sh_degree + 1) ** 2])
     )
+    sh = sh * exposure
+    sh[:, 0] += (exposure - 1) * 0.5 / BAND_0
     opacities = found.logit_opacities.sigmoid().float().cpu().numpy()
     field = UsdVol.ParticleField.Define(stage, f"{ROOT}/Surfels")
     prim = field.GetPrim()

@@ -323,7 +323,9 @@ def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], 
         exposures = model.exposures
 
     def shown(camera: Camera) -> torch.Tensor:
-        image = scene.render(motion.camera(camera), background=model.options.background)
+        if scene.exposures is not None:
+            return scene.render(motion.camera(camera), background=model.options.background)
+        image = scene.render_at_mean(motion.camera(camera), model.options.background)
         return image if exposures is None else image * exposures.factors(camera.to(device))
 
     figures: Figures = {}

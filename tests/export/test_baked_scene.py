@@ -11,9 +11,9 @@ import torch
 import nexwarp as nw
 from nexwarp import ops
 from nexwarp.errors import FormatError, MissingError
-from nexwarp.export.bake import bake
+from nexwarp.export.bake import bake, dimmed
 from nexwarp.export.baked_scene import BakedScene
-from nexwarp.export.glb import make_cards, save_glb
+from nexwarp.export.glb import CUTOFF, LEAST_ALPHA, make_cards, save_glb
 from nexwarp.export.web.baked import BAKED_FILE
 from nexwarp.export.web.export import one_file, page_files
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
@@ -174,6 +174,36 @@ def test_cards_are_read_as_they_were_written(alpha, baked, cameras, tmp_path):
         assert psnr(read.render(camera), expected) > (30 if alpha == "mask" else 60)
 
 
+def test_cards_of_a_bright_scene_are_dimmed_not_clipped(baked, cameras, tmp_path):
+    """At three times the brightness, cards show what they show at one, and `render_at_mean` three times of it."""
+    pytest.importorskip("trimesh")
+    once = make_cards(baked, "blend")
+    state = {name: x.clone() for name, x in baked.surfels.state_dict().items()}
+    state["sh0"] = 3 * state["sh0"] + (3 - 1) * 0.5 / 0.28209479177387814  # SH are around a grey of 0.5
+    state["shN"] *= 3
+    bright = make_cards(dataclasses.replace(baked, surfels=nw.Surfels(state), atlas=3 * baked.atlas), "blend")
+    assert bright.exposure < 0.6 and bright.exposure == pytest.approx(once.exposure / 3, abs=1e-6)
+    opaque = bright.texels[bright.texels[..., 3] >= LEAST_ALPHA["blend"] * CUTOFF][:, :3].amax(1)
+    assert 0.001 < float((opaque == 1).double().mean()) < 0.021
+    assert_close(bright.texels, once.texels, kind="value", name="texels")
+    unexposed = dataclasses.replace(baked.model.options, exposure="mean")
+    model = nw.Model(baked.surfels, None, baked.model.exposures, None, unexposed)
+    assert dimmed(model, torch.full((5, 3), 3.0)) == 1
+    save_glb(tmp_path / "a.glb", bright, list(cameras.values()))
+    read = nw.load_baked(tmp_path / "a.glb")
+    assert read.exposure == bright.exposure
+    background = (0.3, 0.6, 0.9)
+    for camera in cameras.values():
+        image = read.render_at_mean(camera, background)
+        assert (
+            psnr(
+                (image * bright.exposure).clamp(0, 1),
+                bright.render(camera, background=[x * bright.exposure for x in background]),
+            )
+            > 45
+        )
+
+
 def test_damaged_files_give_one_line(files, baked, cameras, tmp_path):
     pytest.importorskip("trimesh")
     save_glb(tmp_path / "good.glb", make_cards(baked), list(cameras.values()))
@@ -184,6 +214,7 @@ def test_damaged_files_give_one_line(files, baked, cameras, tmp_path):
     cases = [(page[: len(page) // 2], ".html"), (b"", ".html"), (b"", ".glb"), (glb[: 28 + length], ".glb")]
     cases += [(b"GIF8" + glb[4:], ".glb"), (glb.replace(b'"VEC3"', b'"VEC9"'), ".glb")]
     cases += [(glb.replace(b'"MASK"', b'"MARK"'), ".glb"), (glb.replace(b'"byteLength"', b'"byteLengte"'), ".glb")]
+    cases.append((re.sub(rb'"exposure":\s*[01]\.', b'"exposure":7.', glb), ".glb"))
     name = f'id="asset:{BAKED_FILE}">'.encode()
     cases.append((page.replace(name, name + b"AAAA"), ".html"))
     for content, suffix in cases:

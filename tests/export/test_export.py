@@ -241,14 +241,14 @@ def sphere_depths(camera: nw.Camera) -> torch.Tensor:
 
 
 def fused(views: list[tuple[nw.Camera, torch.Tensor]]) -> Mesh:
-    """The surface in depths of cameras, in dark red."""
+    """The surface in depths of cameras, in dark red: three times as bright, and dimmed."""
     field = DistanceField(VOXEL, 4 * VOXEL, views[0][1].device)
     for camera, depths in views:
         field.reserve(camera, depths, 10_000)
     field.allocate()
     for camera, depths in views:
-        field.fuse(camera, depths, depths.new_tensor([0.5, 0.0, 0.0]).repeat(128, 128, 1))
-    return _without_crumbs(_surface(field, lambda *_: None))
+        field.fuse(camera, depths, depths.new_tensor([1.5, 0.0, 0.0]).repeat(128, 128, 1))
+    return _without_crumbs(_surface(field, lambda colors: 0.5 / float(colors.amax()), lambda *_: None))
 
 
 @pytest.fixture

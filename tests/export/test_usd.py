@@ -1,5 +1,6 @@
 """USDZ files: valid by usd-core's own validators, with the cards and surfels of the model."""
 
+import dataclasses
 import io
 import zipfile
 
@@ -15,6 +16,7 @@ from nexwarp.export.glb import make_cards, quads
 from nexwarp.export.mesh import Mesh
 from nexwarp.export.usd import save_usdz
 from nexwarp.io.pictures import to_uint8
+from nexwarp.kernels.sh import BAND_0
 from tests.export.test_bake import make_model
 from tests.export.web.support import ring
 from tests.tolerances import assert_close
@@ -77,6 +79,13 @@ def test_a_stage_has_the_cards_and_the_surfels(model, cards, views, tmp_path):
     sh = values("radiance:sphericalHarmonicsCoefficients").view(len(surfels), 4, 3)
     assert sh.equal(torch.cat([surfels.sh0, surfels.shN[:, :3]], dim=1).detach())
 
+    save_usdz(tmp_path / "dim.usdz", dataclasses.replace(cards, exposure=0.25), model.surfels, 1, views)
+    dim = Usd.Stage.Open(str(tmp_path / "dim.usdz"))
+    coefficients = dim.GetPrimAtPath("/Scene/Surfels").GetAttribute("radiance:sphericalHarmonicsCoefficients").Get()
+    dimmed = torch.from_numpy(np.array(coefficients)).view(len(surfels), 4, 3)
+    assert dim.GetMetadata("customLayerData")["exposure"] == 0.25
+    light = torch.zeros(4, 1).index_fill(0, torch.tensor(0), 0.5 / BAND_0)  # a grey of 0.5, which SH are added to
+    assert_close(dimmed + light, 0.25 * (sh + light), kind="value", name="dimmed SH")
     for shown, hidden in (("surfels", "Cards"), ("cards", "Surfels")):
         stage.GetDefaultPrim().GetVariantSet("shown").SetVariantSelection(shown)
         visible = {
