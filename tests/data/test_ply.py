@@ -65,17 +65,16 @@ def test_binary_after_another_element(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "names", "values", "expected"),
+    ("names", "values", "expected"),
     [
-        ("f4", "f_dc_0 f_dc_1 f_dc_2", (0.0, -0.5 / BAND_0, 0.5 / BAND_0), (128, 0, 255)),
-        ("f4", "red green blue", (np.nan, np.inf, -np.inf), (128, 255, 0)),
-        ("f4", "s t u", (1, 2, 3), (128, 128, 128)),
+        ("f_dc_0 f_dc_1 f_dc_2", (0.0, -0.5 / BAND_0, 0.5 / BAND_0), (128, 0, 255)),
+        ("red green blue", (np.nan, np.inf, -np.inf), (128, 255, 0)),
+        ("s t u", (1, 2, 3), (128, 128, 128)),
     ],
 )
-def test_colors_of_every_kind(tmp_path, kind, names, values, expected):
-    word = {"f4": "float", "u2": "ushort", "u1": "uchar"}[kind]
-    header = vertex(1, *XYZ, *(f"{word} {name}" for name in names.split()))
-    body = struct.pack("<3f", 0, 0, 0) + np.array(values, "<" + kind).tobytes()
+def test_colors_of_floats(tmp_path, names, values, expected):
+    header = vertex(1, *XYZ, *(f"float {name}" for name in names.split()))
+    body = struct.pack("<6f", 0, 0, 0, *values)
     (tmp_path / "a.ply").write_bytes(ply(header, body))
     assert read_ply(tmp_path / "a.ply").colors.tolist() == [list(expected)]
 
@@ -91,7 +90,6 @@ FACES = "element face 1\nproperty list uchar int i\n"
 ONE = struct.pack("<3f", 1, 2, 3)
 BAD = {
     "empty": (b"", "does not begin with 'ply'"),
-    "text": (b"solid cube\n", "does not begin with 'ply'"),
     "no end": (b"ply\nformat ascii 1.0\nelement vertex 1\n", "truncated, the PLY header has no end_header"),
     "no format": (b"ply\nelement vertex 1\nproperty float x\nend_header\n", "a PLY header with a format, found none"),
     "odd format": (b"ply\nformat morse 1.0\nend_header\n", "got the line 'format morse 1.0'"),
@@ -101,7 +99,6 @@ BAD = {
     "no z": (ply(vertex(1, *XYZ[:2]), ONE), "expected vertices with x, y and z, found no z"),
     "x twice": (ply(vertex(1, "float x", *XYZ), ONE + ONE), "properties of different names"),
     "truncated": (ply(vertex(2, *XYZ), ONE + ONE[:-1]), "truncated, expected 2 of element vertex, got 23 bytes"),
-    "more than there is": (ply(vertex(10**17, *XYZ), ONE), "truncated, expected 100,000,000,000,000,000 of element"),
     "ascii beyond the end": (ply(vertex(10**17, *XYZ), b"1 2 3\n", "ascii"), "truncated, expected 100,000,000,000,000"),
     "ascii too short": (
         ply(vertex(3, *XYZ), b"1 2 3\n1.23456 2 3\n1.2345 2\n", "ascii"),

@@ -39,12 +39,9 @@ def test_sampling_is_farthest_first(count):
         assert np.array_equal(farthest_points(points, fewer), order[:fewer]), "prefixes agree"
 
 
-def test_far_from_the_origin_costs_no_precision():
+def test_far_from_the_origin_costs_no_precision_and_duplicates_count_once():
     points = np.round(cloud(500) * 1024) / 1024
     assert np.array_equal(farthest_points(points + 4096.0, 500), farthest_points(points, 500))
-
-
-def test_duplicates_count_once():
     points = np.repeat(cloud(40), 3, axis=0)
     order = farthest_points(points, 120)
     assert len(order) == 40 and len(np.unique(points[order], axis=0)) == 40
@@ -54,11 +51,8 @@ def test_duplicates_count_once():
 def test_scales_against_brute_force(count):
     means = cloud(count)[farthest_points(cloud(count), count)]
     np.testing.assert_allclose(predecessor_scales(means), brute_force_scales(means), rtol=1e-9)
-
-
-def test_scales_are_exact_in_any_order():
-    """Sorted along a line, predecessors lie on one side and far down the neighbour lists."""
-    means = np.concatenate([cloud(600), cloud(600, 1) * 0.01])
+    # Sorted along a line, predecessors lie on one side and far down the neighbour lists.
+    means = np.concatenate([cloud(count // 4), cloud(count, 1) * 0.01])
     np.testing.assert_allclose(predecessor_scales(means), brute_force_scales(means), rtol=1e-9)
 
 
@@ -109,9 +103,7 @@ def test_filter_keeps_the_better_half():
     errors = np.arange(11.0)
     kept = inliers(11, np.array([2] * 9 + [3, 4]), errors)
     assert kept.tolist() == [0, 1, 2, 3, 9, 10]
-
-
-def test_unknown_errors_do_not_count_against_a_point():
+    # Unknown errors do not count against a point.
     errors = np.where(np.arange(100) % 2 == 0, -1.0, 0.5)
     assert len(inliers(100, None, errors)) == 100
     assert inliers(4, None, np.array([0.5, 0.5, 0.5, np.nan])).tolist() == [0, 1, 2]

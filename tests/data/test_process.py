@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scipy.ndimage import gaussian_filter, shift
 
 from nexwarp.cli import main as cli
-from nexwarp.cli.commands import needs_cameras
 from nexwarp.data import load_scene
-from nexwarp.data.scene import SceneSource
 from nexwarp.data.sfm.frames import motion, sharpness, take_frames
 from nexwarp.data.sfm.photos import judged, read_photos
 from nexwarp.data.sfm.process import process
@@ -103,8 +102,6 @@ def test_blurred_and_repeated_frames_are_left_out_and_named(tmp_path: Path) -> N
 
 
 def test_photos_that_are_blurred_or_repeated_are_named_and_kept(tmp_path: Path) -> None:
-    from PIL import Image
-
     picture, names = texture(), [f"{i}.png" for i in range(6)]
     for index, name in enumerate(names):
         window = picture[20:140, 10 * min(index, 4) : 10 * min(index, 4) + 160]
@@ -144,12 +141,6 @@ def test_bad_videos_are_one_line_and_leave_nothing(tmp_path: Path, capsys: pytes
     cut.write_bytes(still.read_bytes()[: still.stat().st_size // 2])
     assert cli.main(["process", str(cut), str(scene)]) == 2
     assert not scene.exists() and not scene.parent.exists()
-
-
-def test_videos_are_known_by_their_suffix(tmp_path: Path) -> None:
-    (tmp_path / "scene.mp4").mkdir()
-    assert needs_cameras(SceneSource("a/walk.MOV"))
-    assert not any(needs_cameras(SceneSource(path)) for path in ("a/walk", str(tmp_path / "scene.mp4"), "demo"))
 
 
 @pytest.mark.slow

@@ -12,7 +12,6 @@ import torch
 from PIL import Image
 
 from nexwarp.data import load_scene
-from nexwarp.data.images import downscale_image
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.scene import SceneSource
 from nexwarp.errors import MissingError, SceneError
@@ -102,11 +101,6 @@ def test_loads_what_was_written(tmp_path):
         assert np.array_equal(view.image.numpy(), photo)
 
 
-def test_simple_pinhole_has_one_focal_length(tmp_path):
-    camera = load_scene(make_scene(tmp_path, model="SIMPLE_PINHOLE", params=(41.0, 20.5, 19.75))).train[0].camera
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (41.0, 41.0, 20.5, 19.75)
-
-
 def test_every_eighth_view_by_name_is_for_testing(tmp_path):
     names = [f"{index:02d}.png" for index in (5, 16, 3, 0, 9, 12, 7, 1, 14, 2, 11, 4, 8, 15, 6, 10, 13)]
     scene = load_scene(make_scene(tmp_path, names=names))
@@ -162,7 +156,9 @@ def test_what_cannot_be_excluded_is_told(tmp_path, exclude, error, match):
 
 
 def test_scale_is_the_reach_of_the_training_cameras(tmp_path):
-    scene = load_scene(make_scene(tmp_path))
+    scene = load_scene(make_scene(tmp_path, model="SIMPLE_PINHOLE", params=(41.0, 20.5, 19.75)))
+    camera = scene.train[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (41.0, 41.0, 20.5, 19.75)
     centres = torch.stack([view.camera.position for view in scene.train]).double()
     reach = (centres - centres.mean(dim=0)).norm(dim=1).max().item()
     assert scene.scale == pytest.approx(1.1 * reach, rel=1e-5)
@@ -191,12 +187,6 @@ def test_downscale_scales_pixels_and_keeps_areas(tmp_path, downscale):
             block = one.image[row * downscale : (row + 1) * downscale, column * downscale : (column + 1) * downscale]
             mean = block.double().mean(dim=(0, 1))
             assert (other.image[row, column].double() - mean).abs().max() <= 0.5
-
-
-def test_downscale_rounds_to_nearest():
-    image = torch.tensor([[0, 1], [1, 1]], dtype=torch.uint8)[:, :, None].repeat(1, 1, 3)
-    assert downscale_image(image, 2).tolist() == [[[1, 1, 1]]]
-    assert downscale_image(255 * torch.ones(9, 7, 3, dtype=torch.uint8), 3).eq(255).all()
 
 
 def test_smaller_photos_scale_each_axis_by_its_own_ratio(tmp_path):
@@ -267,18 +257,3 @@ def test_bad_scenes_are_told_in_one_line(tmp_path, kind):
     assert isinstance(caught.value, (SceneError, MissingError))
     text = str(caught.value)
     assert "\n" not in text and str(tmp_path) in text
-
-
-def test_absent_images_folder_lists_those_that_exist(tmp_path):
-    path = make_scene(tmp_path)
-    (path / "images_2").mkdir()
-    with pytest.raises(MissingError, match=r"images: no folder 'images_8' in .* which has images, images_2$"):
-        load_scene(path, images="images_8")
-
-
-def test_bad_downscale(tmp_path):
-    path = make_scene(tmp_path)
-    with pytest.raises(ValueError, match="downscale: expected at least 1, got 0"):
-        load_scene(path, downscale=0)
-    with pytest.raises(TypeError, match="downscale: expected an int, got float"):
-        load_scene(path, downscale=2.0)  # type: ignore[arg-type]  # what is refused

@@ -12,10 +12,10 @@ from tests.data.test_scene import make_scene
 from tests.scene_writers import write_blender, write_nerfstudio
 
 
-def text(content: str | bytes):
+def text(content: str):
     def make(demo, path):
         write_nerfstudio(demo, path)
-        (path / "transforms.json").write_bytes(content.encode() if isinstance(content, str) else content)
+        (path / "transforms.json").write_text(content)
         return path
 
     return make
@@ -39,10 +39,8 @@ DOUBLE = (2 * np.eye(4)).tolist()
 SINGULAR = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
 BAD = {
     "no JSON": (text("{frames: []"), r"transforms.json: expected JSON, could not parse it"),
-    "no text": (text(b"\xff\xfe\x00"), "expected JSON"),
     "a list": (text("[]"), "expected a JSON object, got list"),
     "NaN": (text('{"frames": [NaN]}'), "NaN is no JSON number"),
-    "too deep": (text('{"frames": ' + "[" * 100_000), "nested too deeply|could not parse"),
     "a number of 5,000 digits": (text('{"frames": [{"w": ' + "9" * 5000 + "}]}"), "could not parse"),
     "no frames": (spoilt(lambda data: data.pop("frames") and None), "frames: expected a list .*, got None"),
     "empty frames": (spoilt(lambda data: data["frames"].clear()), r"frames: expected a list .*, got \[\]"),
@@ -137,6 +135,9 @@ def test_a_photo_may_not_be_in_both_of_blenders_files(demo, tmp_path):
         ({"background": (0, 0, 2)}, ValueError, "background: expected white, black, random or three numbers"),
         ({"background": 0.5}, ValueError, "background: expected white, black, random or three numbers"),
         ({"points": "absent.ply"}, FileNotFoundError, "absent.ply: no such file"),
+        ({"downscale": 0}, ValueError, "downscale: expected at least 1, got 0"),
+        ({"downscale": 2.0}, TypeError, "downscale: expected an int, got float"),
+        ({"images": "i_8"}, FileNotFoundError, r"images: no folder 'i_8' in .* which has images$"),
         ({"points": 3}, TypeError, "points: expected the path of a PLY file, got int"),
     ],
 )

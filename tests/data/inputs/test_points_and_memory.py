@@ -33,9 +33,7 @@ def test_photos_that_do_not_fit_are_refused_before_they_are_read(tmp_path, monke
     monkeypatch.undo()
     monkeypatch.setattr(nexwarp.data.scene, "available_memory", lambda: need // 3)
     load_scene(path, downscale=2)
-
-
-def test_a_thousand_photos_of_eight_megapixels_fit_8_gb_at_half_size():
+    # A thousand photos of eight megapixels fit 8 GB at half size.
     sizes = [(3264, 2448)] * 1000
     assert nexwarp.data.scene.photos_bytes(sizes, 2, 3) < 0.9 * 7.2e9 < nexwarp.data.scene.photos_bytes(sizes, 1, 3)
     assert nexwarp.machine.available_memory() > 2**20
