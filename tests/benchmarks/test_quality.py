@@ -2,20 +2,15 @@
 
 import dataclasses
 import json
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import torch
 
 import nexwarp as nw
-from benchmarks.quality import curve
 from benchmarks.quality.__main__ import main
-from benchmarks.quality.jobs import FOLDS, Row, TrainingJob, config_of, scene_of
+from benchmarks.quality.jobs import FOLDS, TrainingJob, scene_of
 from benchmarks.timing import ROOT
-from nexwarp.run.evaluate import evaluate
-from nexwarp.train.stages import StageRunner
-from tests.narrowing import present
 from tests.scene_writers import write_demo
 
 
@@ -59,26 +54,6 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
     assert main(["table", str(out)]) == 0
     assert "| tiny, photos reduced by 2 | 60 | 4 | mine |" in capsys.readouterr().out
     torch.set_num_threads(threads)
-
-
-@pytest.mark.filterwarnings("ignore:LPIPS is left out")
-def test_a_curve_has_points_at_its_times_and_at_the_end(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Teachers' steps count, and what it takes to look does not."""
-    clock = iter(range(10_000))  # each reading of the clock is a second later
-    monkeypatch.setattr("time.perf_counter", lambda: float(next(clock)))
-    watch = curve.Curve(nw.load_scene(folder / "tiny"), begin=0.0)
-    job = TrainingJob("tiny", "", "mine", 60, 0, 20)
-    config = config_of(job, Row("mine", settings={"texture.levels": 4, "texture.table_size": 1024, "teachers": 1}))
-    runner = StageRunner(watch.scene, config, "cpu", curve.WatchedStages(watch))
-    runner.train()
-    model = runner.finish()
-    watch.look(lambda: lambda camera: model.render(camera).image, last=True)
-    seconds = [present(point["seconds"]) for point in watch.points]
-    assert len(seconds) > 4 and seconds[-1] < next(clock) - len(seconds)
-    for before, after in pairwise([0.0, *seconds[:-1]]):
-        assert any(before < mark <= after for mark in curve.TIMES)
-    last = watch.points[-1]["psnr"]
-    assert last == pytest.approx(evaluate(model, watch.scene.test)["psnr"])
 
 
 def test_the_documents_have_the_kept_figures(tmp_path: Path) -> None:
