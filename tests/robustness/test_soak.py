@@ -52,14 +52,6 @@ def grown(samples: list[dict[str, float]]) -> dict[str, tuple[float, float]]:
     return found
 
 
-def test_growth_is_told_from_ups_and_downs():
-    mib, count = 2**20, 5000
-    flat = [500 * mib + i % 7 * 9 * mib for i in range(count)]
-    warming = [100 * mib + 200 * mib * min(i, 400) // 400 for i in range(count)]
-    leak = [500 * mib + 4000 * i for i in range(count)]
-    assert [bool(grown([{"host": x} for x in values])) for values in (flat, warming, leak)] == [False, False, True]
-
-
 @pytest.mark.timeout(0)
 def test_steps_and_frames_leave_memory_as_it_is(device, tmp_path):
     """Frames with and without gradients, of a model loaded each time, from changing cameras and of changing sizes."""
