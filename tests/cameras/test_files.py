@@ -139,7 +139,6 @@ BAD = [
     (PATH | {"camera_path": [3]}, r"camera_path\[0\]: expected a JSON object, got 3"),
     (PATH | {"camera_type": "fisheye"}, "camera_type: expected perspective, got 'fisheye'"),
     (PATH | {"render_width": 0}, "render_width: expected a number above 0, got 0"),
-    (PATH | {"render_width": 10**400}, "render_width: expected a number"),
     (PATH | {"render_width": 10**9}, "render_width: expected at most 65536 pixels, got 1e"),
     (PATH | {"render_height": 10.5}, "render_height: expected a whole number of pixels, got 10.5"),
     (PATH | {"fps": "fast"}, "fps: expected a number above 0, got 'fast'"),
@@ -149,9 +148,7 @@ BAD = [
     (entry(camera_to_world=SINGULAR), r"camera_path\[1\]: camera_to_world: expected an invertible pose, got the sing"),
     (entry(camera_to_world=[0.0] * 16), r"camera_path\[1\]: camera_to_world: expected the last row 0, 0, 0, 1"),
     (entry(camera_to_world=[10**400, *FLAT[1:]]), r"camera_path\[1\]: camera_to_world: expected a 4x4 matrix of"),
-    (entry(camera_to_world=[[1, 2], [3]]), r"camera_path\[1\]: camera_to_world: expected a 4x4 matrix of numbers"),
     (entry(camera_to_world=[1.0] * 9), r"camera_path\[1\]: camera_to_world: expected a 4x4 matrix of numbers"),
-    (entry(camera_to_world="eye"), r"camera_path\[1\]: camera_to_world: expected a 4x4 matrix of numbers, got eye"),
     (entry(camera_to_world=[math.nan, *FLAT[1:]]), r"camera_path\[1\]: camera_to_world: expected finite numbers"),
     (entry(camera_to_world=[2.0, *FLAT[1:]]), r"camera_path\[1\]: viewmat: expected an orthonormal rotation"),
     (entry(camera_to_world=[-1.0, *FLAT[1:]]), r"camera_path\[1\]: viewmat: expected a rotation with determinant 1"),
@@ -228,12 +225,8 @@ MATRICES = (ROWS[:3], "text", [[float("nan")] * 4] * 4, [[10**400]])
         json.dumps({"validation": {"a": NEAR}}),
     ],
 )
-def test_malformed_cameras(tmp_path, content):
-    file = tmp_path / "cameras.json"
-    file.write_text(content)
-    refused(ValueError, load_cameras, file, names=file, match="expected named cameras as JSON")
-
-
-def test_missing_cameras(tmp_path):
+def test_missing_and_malformed_cameras(tmp_path, content):
     file = tmp_path / "cameras.json"
     refused(FileNotFoundError, load_cameras, file, names=file, match="expected the run's cameras")
+    file.write_text(content)
+    refused(ValueError, load_cameras, file, names=file, match="expected named cameras as JSON")

@@ -295,10 +295,3 @@ def test_cameras_between_lie_on_the_way_to_a_neighbour_that_looks_alike() -> Non
             assert torch.equal(new.K, one.K) and (new.width, new.height, new.near) == (64, 48, 0.2)
             seen.add(round(shares[fits.index(True)], 1))
     assert {-0.5, 0.0, 0.5, 1.0, 1.5} <= seen  # all of the way, and beyond its ends
-
-
-def test_a_camera_without_a_neighbour_stays() -> None:
-    away = camera(torch.tensor([1.0, 0, 0]), torch.tensor([1.0, -1, 0]))
-    for cameras in ([ONE], [ONE, away]):
-        for old, new in zip(cameras, between(cameras, torch.Generator()), strict=True):
-            assert_close(new.viewmat, old.viewmat, kind="value", name="viewmat")

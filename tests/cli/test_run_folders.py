@@ -39,16 +39,6 @@ def test_an_option_of_a_resumed_run_counts_if_it_is_its_default(finished, scene,
     refused(capsys, command, "checkpoint")
 
 
-def test_overwrite_replaces_a_run(finished, scene):
-    (finished / "renders" / "ellipse").mkdir()
-    (finished / "renders" / "ellipse" / "0007.png").touch()
-    command = ["train", str(scene), "--run", str(finished), *FLAGS, "--iterations", "1", "--overwrite"]
-    assert cli.main(command) == 0
-    assert {f.name for f in finished.iterdir()} == RUN_FILES - {"checkpoint.old"}
-    assert {f.name for f in (finished / "renders").iterdir()} == {"test", "compare"}
-    assert read(finished, "metrics.json")["iterations"] == 1
-
-
 def test_overwrite_keeps_what_a_run_does_not_write(finished, scene, tmp_path, capsys):
     """Foreign files stay wherever they are, and links are not followed."""
     elsewhere = tmp_path / "elsewhere"
@@ -60,7 +50,9 @@ def test_overwrite_keeps_what_a_run_does_not_write(finished, scene, tmp_path, ca
     for name in foreign:
         (finished / name).parent.mkdir(parents=True, exist_ok=True)
         (finished / name).write_text(name)
-    (finished / "renders" / "empty").mkdir()
+    for name in ("empty", "ellipse"):
+        (finished / "renders" / name).mkdir()
+    (finished / "renders" / "ellipse" / "0007.png").touch()
     (finished / "renders" / "spiral").symlink_to(elsewhere)
     (finished / "model.safetensors").unlink()
     (finished / "model.safetensors").symlink_to(elsewhere / "model.safetensors")
@@ -71,9 +63,10 @@ def test_overwrite_keeps_what_a_run_does_not_write(finished, scene, tmp_path, ca
         out = capsys.readouterr().out
         assert f"warning: {finished}: not deleted, as nexwarp did not write it: " in out and " more\n" in out
         left = snapshot(finished)
+        assert {f.name for f in (finished / "renders").iterdir()} == {"test", "compare", "empty", "spiral"}
         kept = {f"checkpoint.kept_1/{n[11:]}" if n.startswith("checkpoint/") else n for n in foreign}
         assert {left[name] for name in kept} == {name.encode() for name in foreign}
-        assert (finished / "renders" / "empty").is_dir() and (finished / "renders" / "spiral").is_symlink()
+        assert (finished / "renders" / "spiral").is_symlink()
         assert snapshot(elsewhere) == {"0000.png": b"a picture", "model.safetensors": b"weights"}
     mine = {"notes.txt", "camera_path_0.json", "mine", "checkpoint.kept_1", "export"}
     assert {name.split("/")[0] for name in left} == RUN_FILES | mine

@@ -267,7 +267,7 @@ def test_a_surface_outlasts_some_views_that_see_past_it_but_not_many(past, kept,
     assert ((np.abs(z - 2) < 4 * VOXEL).sum() > 1000) == kept
 
 
-def test_a_sphere_is_a_sphere(sphere):
+def test_a_sphere_is_a_sphere_and_closed_across_blocks(sphere):
     """Within a fifth of a voxel, with normals and triangles that face outwards, and the photos' colour."""
     radii = np.linalg.norm(sphere.vertices, axis=1)
     assert np.abs(radii - RADIUS).mean() < 0.2 * VOXEL and np.abs(radii - RADIUS).max() < VOXEL
@@ -277,10 +277,7 @@ def test_a_sphere_is_a_sphere(sphere):
     assert (np.cross(b - a, c - a) * a).sum(1).min() >= -1e-9
     assert np.abs(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 / (4 * np.pi) - 1) < 0.05
     assert (np.abs(sphere.colors[:, 0].astype(int) - 128) <= 1).all() and (sphere.colors[:, 1:] == 0).all()
-
-
-def test_a_sphere_is_closed_across_blocks(sphere):
-    """Edges have two triangles, but where a triangle was too thin to be kept: vertices on blocks' borders are one."""
+    # Edges have two triangles, but where one was too thin to be kept: vertices on blocks' borders are one.
     edges = np.sort(np.concatenate([sphere.triangles[:, p] for p in ([0, 1], [1, 2], [2, 0])]), axis=1)
     _, counts = np.unique(edges, axis=0, return_counts=True)
     assert (counts == 2).mean() > 0.998 and counts.max() == 2

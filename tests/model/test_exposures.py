@@ -76,15 +76,9 @@ def photographs(
     return cameras, photos, seen
 
 
-def views(
-    cameras: list[Camera],
-    photos: list[torch.Tensor],
-    points: list[torch.Tensor],
-    masks: list[torch.Tensor | None] | None = None,
-) -> list[View]:
-    masks = masks or [None] * len(cameras)
-    parts = zip(cameras, photos, masks, points, strict=True)
-    return [View(camera, photo, mask, f"{i}", None, seen) for i, (camera, photo, mask, seen) in enumerate(parts)]
+def views(cameras: list[Camera], photos: list[torch.Tensor], points: list[torch.Tensor]) -> list[View]:
+    parts = zip(cameras, photos, points, strict=True)
+    return [View(camera, photo, None, f"{i}", None, seen) for i, (camera, photo, seen) in enumerate(parts)]
 
 
 def photo_gains(*photographs: Any) -> tuple[np.ndarray, tuple[float, float, float]]:

@@ -314,7 +314,5 @@ def test_changes_that_are_no_options_are_named() -> None:
     for error, changes in bad:
         with pytest.raises(error, match=rf"^{next(iter(changes))}: expected"):
             model.render(camera, **changes)
-    others: list[Any] = ["camera", None, camera.viewmat, ["camera"]]
-    for other in others:
-        with pytest.raises(TypeError, match=r"^camera: expected a nexwarp\.Camera"):
-            model.render(other)
+    with pytest.raises(TypeError, match=r"^camera: expected a nexwarp\.Camera"):
+        model.render(["camera"])  # type: ignore[list-item]

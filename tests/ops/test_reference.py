@@ -112,13 +112,6 @@ def test_two_layers_by_hand() -> None:
         assert hits.ids[2, 2].tolist() == [1, 0, -1, -1][:max_hits]
 
 
-def test_the_buffer_is_heaviest_first() -> None:
-    hits = collect(*sheets((2.0, 0.1), (3.0, 0.8), (4.0, 0.9)), VIEW, 2)
-    assert hits.ids[2, 2].tolist() == [1, 2]
-    value_of(hits.weights[2, 2], [0.9 * 0.8, 0.9 * 0.2 * 0.9], "weights")
-    value_of(hits.plain[2, 2], [0.1, 0.0, 0.0], "plain")
-
-
 def test_nearer_wins_a_tie_of_weights() -> None:
     """0.8 x 0.25 is 0.2 to the last bit."""
     hits = collect(*sheets((3.0, 0.25), (2.0, 0.2)), VIEW, 1)
@@ -182,17 +175,6 @@ def make_field(sh_degree: int = 3) -> Texture:
     count = 3 * (sh_degree + 1) ** 2
     mlp = [0.6 * torch.randn(shape, dtype=torch.float64) for shape in ((6, 4), (5, 6), (count, 5))]
     return Texture(torch.randn(2, 8, 2, dtype=torch.float64), tensor(1.0, 2.5), mlp)
-
-
-def test_a_field_of_zeros_is_grey() -> None:
-    scene = random_scene(6, dtype=torch.float64)
-    field = make_field()
-    field.mlp[-1].zero_()
-    out = render(shape_of(scene), scene["sh"], field, scene["viewmat"], view_of(scene), background=(0.1, 0.2, 0.3))
-    grey = 0.5 * out.weights.sum(-1, keepdim=True).expand(-1, -1, 3)
-    assert_close(out.textured, grey, kind="value", name="textured")
-    behind = (1 - out.alpha)[..., None] * tensor(0.1, 0.2, 0.3)
-    assert_close(out.image, out.plain + grey + behind, kind="value", name="image")
 
 
 def test_the_field_is_asked_where_the_pixel_sees_the_surfel() -> None:

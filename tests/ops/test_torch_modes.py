@@ -176,11 +176,3 @@ def test_checkpoint_draws_again(device):
     for draw in draws.values():
         again = torch.utils.checkpoint.checkpoint(draw, means, use_reentrant=False)
         assert torch.equal(*(torch.autograd.grad(x, means)[0] for x in (again, draw(means))))
-
-
-@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.vmap, torch.func.jacrev])
-def test_function_transforms_are_refused_by_torch(transform, device):
-    draws, means = drawings(device)
-    tensors = means.detach()[None] if transform is torch.func.vmap else means.detach()
-    with pytest.raises(RuntimeError, match="must override the setup_context"):
-        transform(draws["rasterize"])(tensors)

@@ -106,6 +106,8 @@ def test_paths_are_those_of_the_runs_cameras(run: Path) -> None:
         for i in (0, 3):
             assert picture(folder / f"{i:04d}.png").equal(rendered(run, path[i]))
     assert not (run / "renders" / "test").exists()
+    assert command("render", run, "--path", "ellipse", "--frames", "2") == 0
+    assert files(run / "renders" / "ellipse") == {"0000.png", "0001.png"}, "no frames of the longer one"
 
 
 def test_the_path_suits_the_capture_and_is_told(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,12 +120,6 @@ def test_the_path_suits_the_capture_and_is_told(run: Path, capsys: pytest.Captur
         assert files(run / "renders" / name) == {"0000.png", "0001.png"}
     assert command("render", run, "--frames", "2", "--path", "ellipse") == 0
     assert "as the cameras" not in capsys.readouterr().out
-
-
-def test_a_shorter_path_leaves_no_frames_of_a_longer_one(run: Path) -> None:
-    for count in (3, 2):
-        assert command("render", run, "--path", "ellipse", "--frames", count) == 0
-    assert files(run / "renders" / "ellipse") == {"0000.png", "0001.png"}
 
 
 @pytest.mark.filterwarnings("default:.*the scene cannot be read")
@@ -275,15 +271,12 @@ def test_bad_render_options(refuses: Callable[..., None], flags: list[str], word
     refuses(["render", *flags], *words)
 
 
-def test_bad_path_files(refuses: Callable[..., None], run: Path) -> None:
+def test_bad_path_files_and_cameras_that_no_path_suits(refuses: Callable[..., None], run: Path) -> None:
     path = run.parent / "flight.json"
     path.write_text("{")
     refuses(["render", "--path", path], str(path), "expected JSON")
     save_camera_path(path, ring(2))
     refuses(["render", "--path", path, "--frames", "3"], "--frames: expected no value with", "got 3")
-
-
-def test_cameras_that_no_path_suits(refuses: Callable[..., None], run: Path) -> None:
     alone = "expected at least two distinct ones"
     camera = ring(1)[0].to(torch.float32)
     save_cameras(run / "cameras.json", {"train": {"0": camera}, "test": {"1": camera}})

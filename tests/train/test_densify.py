@@ -190,17 +190,6 @@ def test_prune_removes_exactly_the_transparent_ones():
     assert densifier.errors.tolist() == [0.0] * 4
 
 
-@pytest.mark.parametrize(("at_cap", "changed"), [(True, 3), (False, 0)])
-def test_prune_at_the_cap_is_a_choice(at_cap, changed):
-    surfels, optimizer = make(10, opacity=0.5)
-    with torch.no_grad():
-        surfels.logit_opacities[:3] = -8.0
-    densifier = densifier_of(surfels, budget=10, prune_at_cap=at_cap, fraction=0.5)
-    densifier.accumulate(torch.ones(10))
-    assert counts(densifier.step(optimizer, generator()), 10) == (changed, changed)
-    assert len(surfels) == 10 and int((surfels.logit_opacities < -7).sum()) == 3 - changed
-
-
 def addresses(surfels: nw.Surfels, optimizer: torch.optim.Adam, densifier: DensityControl) -> list[int]:
     """Of all tensors that a CUDA graph of a training step reads and writes."""
     moments = [x for state in optimizer.state.values() for x in state.values()]
@@ -236,16 +225,20 @@ def test_at_the_budget_children_take_the_rows_of_pruned_surfels():
         assert torch.equal(now[others], moments[key][others]) and not now[[*parents, *gone]].any(), key
 
 
-@pytest.mark.parametrize(("at_cap", "count", "more", "left"), [(True, 2, 3, 21), (False, 3, 1, 18)])
-def test_a_round_that_splits_prunes_in_either_mode(at_cap, count, more, left):
-    """At the budget, places are filled before rows are appended."""
+@pytest.mark.parametrize(
+    ("budget", "at_cap", "faint", "more", "pruned"),
+    [(20, True, 3, 3, 3), (20, False, 3, 0, 0), (21, True, 2, 3, 2), (21, False, 3, 1, 3)],
+)
+def test_prune_at_the_cap_is_a_choice_and_other_rounds_prune(budget, at_cap, faint, more, pruned):
+    """Near the budget, places are filled before rows are appended."""
     surfels, optimizer = make(20, opacity=0.5)
     with torch.no_grad():
-        surfels.logit_opacities[:count] = -8.0
-    densifier = densifier_of(surfels, budget=21, prune_at_cap=at_cap, fraction=0.2 if at_cap else 0.05)
-    densifier.accumulate(torch.ones(20) if at_cap else torch.eye(20)[10])
-    assert counts(densifier.step(optimizer, generator()), 20) == (more, count)
-    assert len(surfels) == left and bool((surfels.opacities > 0.4).all()) and densifier.errors.shape == (left,)
+        surfels.logit_opacities[:faint] = -8.0
+    densifier = densifier_of(surfels, budget=budget, prune_at_cap=at_cap, fraction=0.05 if more == 1 else 0.2)
+    densifier.accumulate(torch.eye(20)[10] if more == 1 else torch.ones(20))
+    assert counts(densifier.step(optimizer, generator()), 20) == (more, pruned)
+    assert len(surfels) == 20 + more - pruned and densifier.errors.shape == (len(surfels),)
+    assert int((surfels.opacities < 0.4).sum()) == faint - pruned
 
 
 @pytest.mark.parametrize(("fraction", "candidates", "more"), [(0.0, 16, 0), (0.05, 16, 1), (0.5, 1, 1), (0.5, 16, 4)])

@@ -11,13 +11,10 @@ import torch
 import nexwarp as nw
 from nexwarp.data import Scene, View
 from nexwarp.model.graphs import _kind
-from nexwarp.train.parallel import ParallelTrainer
-from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import LossWeights
 from nexwarp.train.target import TrainingViews
 from nexwarp.train.trainer import Trainer
 from tests.narrowing import present
-from tests.ranks_support import CPU, digest, run_ranks
 from tests.tolerances import assert_close
 from tests.trainer_support import assert_resumed_alike, assert_same_state, small, trained
 
@@ -103,19 +100,6 @@ def test_a_run_with_maps_resumes_and_other_maps_are_another_scene(mapped: Scene,
     other = dataclasses.replace(mapped, train=[mapped.train[0], *(at(view, 4.0) for view in mapped.train[1:])])
     with pytest.raises(nw.errors.CheckpointError, match="photos, masks, depth maps or points have changed"):
         Trainer(other, small(), "cpu").restore(tmp_path)
-
-
-def test_ranks_agree(mapped: Scene, tmp_path: Path) -> None:
-    def work(ranks: Ranks) -> object:
-        trainer = ParallelTrainer(mapped, small(), CPU, ranks)
-        terms = trainer.step().losses
-        trainer.run()
-        trainer.check()
-        assert "depth_maps" in terms
-        return digest(trainer)
-
-    first, second = run_ranks(2, work, tmp_path)
-    assert first == second
 
 
 @pytest.mark.cuda

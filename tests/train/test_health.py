@@ -173,20 +173,6 @@ def test_too_little_memory_says_what_to_lower(scene, folder, tmp_path, monkeypat
     assert err.startswith("nexwarp: error: out of memory at iteration 1: it needed 2.50 GiB") and err.count("\n") == 1
 
 
-# Checkpoints that others made, whose checksums agree, or of other runs
-
-
-def test_checkpoints_of_other_runs_are_refused(scene, tmp_path):
-    run = Trainer(scene, SMALL, "cpu")
-    run.step()
-    run.save(tmp_path)
-    fewer = dataclasses.replace(scene, train=scene.train[:-1])
-    shorter = dataclasses.replace(SMALL, iterations=24)
-    for other, settings, reason in ((scene, shorter, "settings"), (fewer, SMALL, "views")):
-        with pytest.raises(CheckpointError, match=f"expected a checkpoint of this run, .*{reason}"):
-            Trainer(other, settings, "cpu").restore(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("name", "change", "match"),
     [
@@ -194,7 +180,6 @@ def test_checkpoints_of_other_runs_are_refused(scene, tmp_path):
         ("order", lambda _: [0, 77], "order"),
         ("surfels.means", lambda x: x.half(), "float32"),
         ("surfels.means", lambda x: x[:-1], ""),
-        ("surfels.", lambda x: x[:0], "at least one surfel"),
         ("adam.surfels.means.exp_avg", lambda x: x.T.contiguous(), "shape of its parameter"),
         ("densify.errors", lambda x: x[:1], "one for each"),
         ("rng.torch", lambda x: x[:7], ""),

@@ -11,18 +11,9 @@ from nexwarp.data import initial_points
 from nexwarp.train.initial import initial_surfels, quats_towards, texture_shape
 from nexwarp.train.recipe import TextureConfig, preset
 from tests.reference.collect import rotations
-from tests.trainer_support import TEXTURE, rescaled, small
+from tests.trainer_support import TEXTURE, small
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
-
-@pytest.mark.parametrize("factor", [100.0, 1e-3])
-def test_texture_follows_the_scale_of_the_scene(scene, factor):
-    one, other = texture_shape(scene, small()), texture_shape(rescaled(scene, factor), small())
-    assert other["min_resolution"] == pytest.approx(one["min_resolution"] / factor, rel=1e-4)
-    assert other["max_resolution"] == pytest.approx(one["max_resolution"] / factor, rel=1e-4)
-    ends = ("min_resolution", "max_resolution")
-    assert {k: v for k, v in one.items() if k not in ends} == {k: v for k, v in other.items() if k not in ends}
 
 
 def test_finest_cells_are_the_pixels_of_nearly_all_views(scene):

@@ -49,44 +49,6 @@ def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) ->
     assert trainer.render_options().background == (1.0, 1.0, 1.0)
 
 
-SQUARE = slice(10, 26), slice(14, 34)
-
-
-def with_intruder(scene: Scene, masked: bool) -> Scene:
-    """A red square before every training photo, and masks that leave it out."""
-    mask = torch.ones(36, 48, dtype=torch.bool)
-    mask[SQUARE] = False
-
-    def spoilt(view: View) -> View:
-        image = view.image.clone()
-        image[SQUARE] = torch.tensor([255, 0, 0], dtype=torch.uint8)
-        return dataclasses.replace(view, image=image, mask=mask if masked else None)
-
-    return dataclasses.replace(scene, train=[spoilt(view) for view in scene.train])
-
-
-def redness(trainer: Trainer) -> float:
-    """How much redder than their photos the test views are, in the middle, 0 to 1."""
-    views = trainer.scene.test
-    with torch.no_grad():
-        images = [out.image for out in trainer.model().render([view.camera for view in views])]
-    pairs = [(image[SQUARE], view.image[SQUARE] / 255) for image, view in zip(images, views, strict=True)]
-    return sum(((a[..., 0] - a[..., 2]) - (b[..., 0] - b[..., 2])).mean().item() for a, b in pairs) / len(pairs)
-
-
-@pytest.mark.timeout(120)
-def test_what_masks_leave_out_does_not_appear(scene: Scene) -> None:
-    """An intruder that moves with the camera, before every photo; learnt without masks, left out with them."""
-    results = []
-    for photographed in (scene, with_intruder(scene, masked=False), with_intruder(scene, masked=True)):
-        trainer = make_trainer(photographed, iterations=100, max_surfels=400)
-        trainer.run()
-        results.append(redness(trainer))
-    clean, without, with_masks = results
-    assert without > clean + 0.08
-    assert abs(with_masks - clean) < 0.2 * (without - clean)
-
-
 def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
     mask = torch.zeros(36, 48, dtype=torch.bool)
     mask[:, :24] = True

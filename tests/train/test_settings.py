@@ -3,12 +3,10 @@
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 from PIL import Image
 
-import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
 from nexwarp.data.scene import SceneSource
@@ -135,16 +133,6 @@ def test_settings_of_another_kind_are_refused(change):
     with pytest.raises(ValueError, match=r"^config: expected the settings of a nexwarp run") as caught:
         config_from_dict(change(Config().as_dict()))
     assert "\n" not in str(caught.value)
-
-
-def test_a_run_keeps_what_was_set(run):
-    stored = json.loads((run / "config.json").read_text())["config"]
-    config = config_from_dict(stored)
-    changes: dict[str, Any] = {"texture.levels": 4, "texture.table_size": 256, "texture.width": 16, "skybox": 90}
-    changes |= {"mask_mode": "background", "rates.means": (1e-4, 1e-6), "iterations": 2, "max_surfels": 50}
-    assert config == with_settings(preset("default"), changes)
-    texture = nw.load(run).texture
-    assert texture is not None and texture.grid.shape == (4, 256, 4)
 
 
 def test_resume_agrees_or_is_refused(run, scene, capsys):

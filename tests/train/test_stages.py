@@ -264,10 +264,6 @@ def test_a_longer_run_keeps_its_teachers(run: Path, command: Callable[..., int],
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
     assert [(run / "teachers" / name / "model.safetensors").read_bytes() for name in "12"] == teachers
     assert read_run(run).config.iterations == 30 and dataclasses.asdict(read_run(run).own) == OWN
-    model = model_of(run)
-    (run / "model.safetensors").unlink()
-    assert command(run, "--resume", iterations=30) == 0
-    assert model_of(run) == model
 
 
 def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(run, command, capsys):
@@ -311,21 +307,6 @@ def test_a_run_that_lost_a_teacher_says_so_before_it_trains(run, finished, comma
     assert command(run, "--resume") == 2
     told = "".join(capsys.readouterr().err.split())
     assert f"{run}/teachers/2:expectedateacherwiththesettingsof{run},gotothers" in told
-
-
-def test_an_older_run_keeps_teachers_of_its_own_budget(finished, command, tmp_path):
-    """Its config.json does not say how large they are; it resumes with the teacher that is complete."""
-    whole, run = tmp_path / "whole", tmp_path / "run"
-    create_run(whole, dataclasses.replace(read_run(finished), own=OwnTeachers(2, 4)))
-    data = json.loads((whole / "config.json").read_text())
-    del data["own_teachers"]["max_surfels"]
-    (whole / "config.json").write_text(json.dumps(data))
-    shutil.copytree(whole, run)
-    assert command(whole, "--resume") == 0
-    shutil.copytree(whole / "teachers" / "1", run / "teachers" / "1")
-    assert command(run, "--resume") == 0
-    assert {read_run(run / "teachers" / name).config.max_surfels for name in "12"} == {60}
-    assert model_of(run) == model_of(whole) != model_of(finished)
 
 
 def test_memory_that_a_teacher_lacks_is_told_as_its_own(command, tmp_path, monkeypatch, capsys):

@@ -106,17 +106,6 @@ def test_own_losses_are_captured(scene: Scene) -> None:
         assert torch.equal(value, other), name
 
 
-@pytest.mark.cuda
-@pytest.mark.filterwarnings("ignore:The AccumulateGrad node's stream does not match:UserWarning")  # of torch, after it
-def test_a_loss_that_cannot_be_captured_warns_and_trains_on(scene: Scene) -> None:
-    def loss(rendering: nw.Rendering, target: nw.Target) -> torch.Tensor:
-        return rendering.alpha.mean() * rendering.alpha.max().item()  # waits for the GPU
-
-    with pytest.warns(UserWarning, match="launched kernel by kernel, not as CUDA graphs: "):
-        model = nw.train(scene, SMALL, device="cuda", losses={"own": loss})
-    assert model.meta["iteration"] == SMALL.iterations
-
-
 def parts(scene: Scene) -> dict[str, Any]:
     views = sorted(scene.train + scene.test, key=lambda view: view.name)
     return {
