@@ -99,7 +99,6 @@ def write_distorted(demo: Path, folder: Path, lens: Lens) -> Path:
 
 
 def write_text(demo: Path, folder: Path) -> Path:
-    """Write a COLMAP scene with its model as text."""
     shutil.copytree(demo / "images", folder / "images")
     (folder / "sparse" / "0").mkdir(parents=True)
     reconstruction_of(demo).write_text(str(folder / "sparse" / "0"))

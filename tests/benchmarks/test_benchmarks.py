@@ -1,5 +1,3 @@
-"""The benchmarks measure what they say."""
-
 import json
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""The comparison with the paper: one command makes the table."""
-
 import json
 from pathlib import Path
 

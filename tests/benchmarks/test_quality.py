@@ -1,5 +1,3 @@
-"""The quality benchmark: its views, its trainings from end to end, its tables."""
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Cameras on disk, of a run and of nerfstudio: round trips, conventions, and one line for what is wrong."""
-
 import json
 import math
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Laws of camera paths."""
-
 import math
 from collections.abc import Callable
 from typing import Any

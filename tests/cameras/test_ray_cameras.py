@@ -1,5 +1,3 @@
-"""Cameras of rays: their pictures are those of pinholes in all directions."""
-
 import dataclasses
 import math
 

@@ -16,7 +16,6 @@ def scene(tiny_folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished run."""
     run = tmp_path_factory.mktemp("runs") / "nested" / "tiny"
     assert cli.main(["train", str(scene), "--run", str(run), *FLAGS]) == 0
     return run

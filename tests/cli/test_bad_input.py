@@ -1,5 +1,3 @@
-"""What the command line cannot use is one line that names it, and nothing is written."""
-
 import importlib.util
 import shutil
 import sys

@@ -1,5 +1,3 @@
-"""`nexwarp edit`: what it writes, what render, export and view then show, and what it refuses."""
-
 import json
 import math
 import re
@@ -109,7 +107,6 @@ def test_the_viewer_s_command_crops_by_the_sphere_it_shows(finished, capsys):
 
 
 def test_measured_points_are_those_of_exports_and_their_command_scales(finished):
-    """Afterwards their distance is the length."""
     edit(finished, "--origin", "1", "-2", "3e-5")
     opened = open_model(finished)
     points = opened.trained.surfels.means.detach().double().numpy()[[0, 1]]

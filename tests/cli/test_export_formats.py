@@ -1,5 +1,3 @@
-"""`nexwarp export`: the web page, glTF and SPZ of a finished run."""
-
 import dataclasses
 import re
 import shutil
@@ -22,7 +20,6 @@ from tests.narrowing import present
 
 @pytest.fixture(autouse=True)
 def few_steps(small_preset, monkeypatch):
-    """Bake quickly."""
     monkeypatch.setattr("nexwarp.export.fit.FEWEST_STEPS", 2)
 
 

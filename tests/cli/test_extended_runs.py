@@ -1,5 +1,3 @@
-"""`--resume --iterations MORE`: a run of more iterations than it was started with."""
-
 import json
 import shutil
 from pathlib import Path

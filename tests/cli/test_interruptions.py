@@ -1,5 +1,3 @@
-"""Runs that are interrupted or killed go on to the same bits."""
-
 import os
 import shutil
 import signal

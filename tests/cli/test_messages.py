@@ -1,5 +1,3 @@
-"""What people see on the command line beside results: versions, suggestions, closed pipes, durations, quiet Warp."""
-
 import os
 import re
 import signal

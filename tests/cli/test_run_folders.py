@@ -1,5 +1,3 @@
-"""Which folders may become a run, and what of a run is never overwritten unasked."""
-
 import json
 import shutil
 from contextlib import nullcontext

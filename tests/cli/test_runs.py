@@ -1,5 +1,3 @@
-"""The command line from a scene to a finished run: train, eval, render and info."""
-
 import csv
 import json
 import shutil

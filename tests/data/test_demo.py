@@ -1,5 +1,3 @@
-"""The demo scene: complete, small, and its photos, cameras and points agree with each other."""
-
 import pytest
 import torch
 

@@ -1,5 +1,3 @@
-"""Depth maps: their files against known numbers, their way to the view's pixels, and their fit to points."""
-
 import dataclasses
 import json
 import shutil

@@ -1,5 +1,3 @@
-"""Lenses: a closed form, the place of every resampled pixel, panoramas, and what is refused."""
-
 import dataclasses
 
 import numpy as np

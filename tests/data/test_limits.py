@@ -1,5 +1,3 @@
-"""What a stranger's files may ask for: nothing is allocated or followed before it is known to be honest."""
-
 import json
 import shutil
 import struct

@@ -1,5 +1,3 @@
-"""Photos of linear light: what is read of them, and what renderings of them hold."""
-
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +60,6 @@ def test_all_16_bits_of_a_png_are_read(tmp_path: Path) -> None:
 
 
 def test_twice_the_light_gives_twice_the_light(tmp_path: Path) -> None:
-    """A scene of twice the light, with twice the white, trains alike, and its renderings hold twice the light."""
     demo, pictures = write_demo(tmp_path / "demo", 32, 24, 4, 60), {}
     for light in (1, 2):
         scene, run = write_text(demo, tmp_path / f"scene{light}"), tmp_path / f"run{light}"

@@ -1,5 +1,3 @@
-"""Photos of 360 degrees: which are told from others, what their views show, and that cameras come back."""
-
 from pathlib import Path
 
 import numpy as np

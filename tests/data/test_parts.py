@@ -1,5 +1,3 @@
-"""Parts of a capture that do not agree: what links them is reported."""
-
 from pathlib import Path
 
 import numpy as np

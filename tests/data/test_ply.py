@@ -1,5 +1,3 @@
-"""Points of PLY files: what was written is read, and what is no such file is one clear line."""
-
 import struct
 
 import numpy as np

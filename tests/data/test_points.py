@@ -1,5 +1,3 @@
-"""Initial points: farthest point sampling and sizes against brute force, and the outlier filter."""
-
 import numpy as np
 import pytest
 import torch

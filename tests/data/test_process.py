@@ -1,5 +1,3 @@
-"""From videos and photos to scenes: which frames are taken, what is named, what is refused."""
-
 import json
 import weakref
 from collections.abc import Callable

@@ -1,5 +1,3 @@
-"""COLMAP scenes: what is read is what was written, and bad input is one clear line."""
-
 import dataclasses
 import json
 import re

@@ -1,5 +1,3 @@
-"""Structure from motion: cameras of rendered photos come back, and what cannot work is one line and leaves nothing."""
-
 import dataclasses
 import json
 import os

@@ -1,5 +1,3 @@
-"""Points on a sphere around the scene: where photos show no point of the cloud, evenly, with the photos' colours."""
-
 import dataclasses
 import math
 

@@ -1,5 +1,3 @@
-"""Training views: photos, masks and alpha agree with each other at any size, however they reach the device."""
-
 from typing import Any
 
 import numpy as np

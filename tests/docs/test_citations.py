@@ -77,6 +77,5 @@ def test_citations_are_in_the_table():
 
 
 def test_equations_of_the_method_page_have_their_numbers():
-    """The page numbers its equations as the paper does; each number once."""
     tags = re.findall(r"\\tag\{(\d+)\}", (ROOT / "docs" / "method.md").read_text(encoding="utf-8"))
     assert tags == [str(n) for n in range(1, 14)]

@@ -87,7 +87,6 @@ def cell(text: Any) -> str:
 
 
 def options_page() -> str:
-    """The text of docs/options.md."""
     page = [SETTINGS, "| KEY | default | `paper` | what | symbol | section |\n|---|---|---|---|---|---|"]
     ours, paper = preset("default"), preset("paper")
     for name in USER_SETTINGS:
@@ -114,7 +113,6 @@ ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def help_text(*command: str, width: int = 100) -> str:
-    """What --help of a command prints."""
     out = io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         patch.setenv("COLUMNS", str(width))
@@ -124,7 +122,6 @@ def help_text(*command: str, width: int = 100) -> str:
 
 
 def commands_page() -> str:
-    """The text of docs/cli.md."""
     page = [COMMANDS_PAGE]
     for command in ([], *([name] for name in cli.COMMANDS)):
         page += [f"## {' '.join(['nexwarp', *command])}", "", "```text", help_text(*command), "```", ""]
@@ -214,7 +211,6 @@ def section_of(made: Any, name: str) -> list[str]:
 
 
 def api_page() -> str:
-    """The text of docs/api.md."""
     table, texts = ["| name | what |", "|---|---|"], []
     for title, rooms in ROOMS.items():
         texts.append(f"## {title}\n")

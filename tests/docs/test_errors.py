@@ -1,5 +1,3 @@
-"""One family of errors, each also the built-in one that callers expect; what of them reaches a terminal."""
-
 import os
 import subprocess
 import sys

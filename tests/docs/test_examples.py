@@ -1,5 +1,3 @@
-"""The examples: each runs in its short form, shows what it is meant to show, and is short."""
-
 import os
 import re
 import subprocess

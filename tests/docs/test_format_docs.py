@@ -1,5 +1,3 @@
-"""format.md says what a run holds, and the pages have Python that reads one: both are tried on a small run."""
-
 import itertools
 import json
 import re
@@ -24,7 +22,6 @@ from tests.scene_writers import expose_photos, write_demo
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, one_torch_thread: None) -> Path:
-    """A small run."""
     folder = tmp_path_factory.mktemp("docs")
     scene = write_demo(folder / "scene", width=48, height=36, views=10, points=200)
     expose_photos(scene)

@@ -1,5 +1,3 @@
-"""What the notebooks keep is what their code gives; `.ci/run` executes them whole."""
-
 import re
 
 import nbformat

@@ -33,7 +33,6 @@ PLATFORMS = (LINUX, {"sys_platform": "win32"}, {"sys_platform": "darwin"})
 
 
 def script(name: str) -> Any:
-    """A module of .ci/."""
     spec = importlib.util.spec_from_file_location(name, ROOT / ".ci" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -79,7 +78,6 @@ def test_the_readme_on_pypi_links_to_files_that_exist() -> None:
 
 
 def read_lock(name: str) -> list[tuple[Requirement, list[str]]]:
-    """Requirements of a lock and their hashes."""
     text = (ROOT / "requirements" / f"{name}.txt").read_text(encoding="utf-8").replace("\\\n", " ")
     lines = [line.split(" --hash=") for line in text.splitlines() if line[:1].isalnum()]
     return [(Requirement(line[0]), [part.strip() for part in line[1:]]) for line in lines]

@@ -1,5 +1,3 @@
-"""Baking: the atlas' layout, the fit, the images of baked scenes, and the glTF and SPZ files."""
-
 import copy
 import json
 import struct

@@ -1,5 +1,3 @@
-"""Baked files read back: the drawing against every surfel at every pixel in float64, and the files' round trips."""
-
 import dataclasses
 import math
 import re

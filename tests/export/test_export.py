@@ -1,5 +1,3 @@
-"""Exported surfels and meshes: what independent readers and an independent renderer make of the files."""
-
 import json
 import struct
 from pathlib import Path

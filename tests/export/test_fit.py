@@ -1,5 +1,3 @@
-"""The fit of baked forms to photos: what it gains, and that it learns from nothing else."""
-
 import dataclasses
 from collections.abc import Sequence
 from statistics import fmean

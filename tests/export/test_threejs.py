@@ -1,5 +1,3 @@
-"""glTF files in three.js, the one that trimesh's wheel has, drawn by Chromium with WebGL2."""
-
 import base64
 import io
 import zipfile

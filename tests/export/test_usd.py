@@ -1,5 +1,3 @@
-"""USDZ files: valid by usd-core's own validators, with the cards and surfels of the model."""
-
 import dataclasses
 import io
 import zipfile

@@ -1,5 +1,3 @@
-"""Files are written under names that nobody can foresee, and are new: no link is ever written through."""
-
 import os
 import shutil
 import threading

@@ -1,5 +1,3 @@
-"""Pictures: what is written is what was given, whole or not at all."""
-
 from pathlib import Path
 
 import pytest

@@ -1,5 +1,3 @@
-"""Videos, judged by decoding them: frames, size, rate, colours."""
-
 from fractions import Fraction
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,3 @@
-"""Sums in fixed point: the same values as sums of floats, and the same bits in whatever order."""
-
 import importlib
 from collections.abc import Callable
 

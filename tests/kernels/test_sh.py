@@ -1,5 +1,3 @@
-"""Plain colours: values and gradients against the reference, for every pair of stored and evaluated degrees."""
-
 import itertools
 from collections.abc import Iterator
 

@@ -1,5 +1,3 @@
-"""Bad input raises ValueError or TypeError that names the argument; the ends of a range are good input."""
-
 import re
 from collections.abc import Callable
 from typing import Any

@@ -1,5 +1,3 @@
-"""Every number of a model is refused on load with one line, or gives a finite picture."""
-
 import functools
 import json
 import math

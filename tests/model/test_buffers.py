@@ -1,5 +1,3 @@
-"""All passes of a view in one file: laws, references, and bits that come back."""
-
 from dataclasses import fields
 from pathlib import Path
 

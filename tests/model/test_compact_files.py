@@ -1,5 +1,3 @@
-"""Compact model files: small, close to the model, and refused with one line where they are damaged."""
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Looks from closer and from farther than training had: the detail is training's, and surfels do not alias."""
-
 import dataclasses
 from typing import Any
 

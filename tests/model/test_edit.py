@@ -1,5 +1,3 @@
-"""Edits of models: motions of surfels against their pictures, regions, and floaters that were planted."""
-
 import json
 import math
 

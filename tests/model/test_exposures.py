@@ -1,5 +1,3 @@
-"""Exposures of photos: found where points tell them, given to cameras between, and no business of the rest."""
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,5 +1,3 @@
-"""Frames as CUDA graphs: the bits of launched frames, whatever changes on the way; launches where one cannot be."""
-
 import copy
 import gc
 import threading

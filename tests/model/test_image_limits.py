@@ -1,5 +1,3 @@
-"""Images that are too large for int32 or for the memory, and arguments that cannot be rendered, get one clear error."""
-
 import gc
 import weakref
 from functools import partial

@@ -1,5 +1,3 @@
-"""The model: `Model.render` is what `nexwarp render` writes, rendering changes nothing, and files hold all of it."""
-
 import dataclasses
 import inspect
 import itertools

@@ -1,5 +1,3 @@
-"""Model files: what comes back is what went in, damage is one clear line."""
-
 import pickle
 from pathlib import Path
 from typing import Any

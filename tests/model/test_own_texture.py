@@ -1,5 +1,3 @@
-"""Textures of one's own: rendered as ours, trained with the surfels, and kept by files or refused."""
-
 import dataclasses
 from pathlib import Path
 from typing import Any

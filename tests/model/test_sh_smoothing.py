@@ -1,5 +1,3 @@
-"""Smooth SH: training views keep theirs, other directions get the smoothest that fit; in closed form."""
-
 import math
 
 import pytest

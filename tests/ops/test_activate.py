@@ -1,5 +1,3 @@
-"""Activation in one kernel is what torch's own functions give, to the ends of every range."""
-
 import pytest
 import torch
 

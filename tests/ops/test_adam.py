@@ -1,5 +1,3 @@
-"""Our Adam takes torch's steps, and regularises the grid as the loss does."""
-
 from typing import Any
 
 import pytest

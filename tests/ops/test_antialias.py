@@ -1,5 +1,3 @@
-"""Widening is what torch's own functions give, and leaves alone what is no farther than training saw it."""
-
 import pytest
 import torch
 
@@ -20,7 +18,6 @@ def antialiased(
     farthest: torch.Tensor,
     focal: float,
 ) -> tuple[torch.Tensor, ...]:
-    """As torch has it."""
     variance = FILTER * ((depths / focal).square() - farthest.square()).clamp_min(0)
     wide = (scales.square() + torch.where(depths > 0, variance, 0)[:, None]).sqrt()
     share = scales / wide

@@ -1,5 +1,3 @@
-"""Renderings at the exposure of a photo, against torch: values, clipping, gradients, refusals."""
-
 import pytest
 import torch
 

@@ -1,5 +1,3 @@
-"""Scenes at the ends of what numbers can say: finite values and gradients, or one clear error."""
-
 from typing import Any
 
 import pytest

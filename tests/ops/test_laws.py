@@ -1,5 +1,3 @@
-"""What must hold of every render, whatever the scene."""
-
 import pytest
 import torch
 

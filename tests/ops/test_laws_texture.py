@@ -1,5 +1,3 @@
-"""A texture, and the jitter of its lookups, change a render by these laws, whatever the scene."""
-
 from typing import Any
 
 import pytest

@@ -1,5 +1,3 @@
-"""The order of blending: by distance, what a pixel shows depends on its ray alone, not on where the camera points."""
-
 import numpy as np
 import pytest
 import torch

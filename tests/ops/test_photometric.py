@@ -1,5 +1,3 @@
-"""The terms that compare pixel by pixel: alone and together against the reference, kinks, what is left out."""
-
 import itertools
 
 import pytest
@@ -141,7 +139,6 @@ def test_inputs_need_not_be_contiguous(device: torch.device) -> None:
 
 
 def test_equal_colours_have_no_gradient(device: torch.device) -> None:
-    """The kink of |x| has the gradient 0 at 0, as in torch."""
     target = torch.rand(4, 5, 3, device=device)
     target[0] = 0.0
     image = target.clone().requires_grad_()

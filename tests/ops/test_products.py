@@ -19,7 +19,6 @@ class Products(TorchDispatchMode):
         self.found: list[str] = []
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        """Note a product, and compute."""
         name = str(func).split(".")[1]
         if name in PRODUCTS:
             self.found.append(name)

@@ -1,5 +1,3 @@
-"""`nw.rasterize` and `nw.compose`: the K-buffer of plain tensors under a shading of one's own."""
-
 import dataclasses
 import textwrap
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""The reference is right: hand-computed values, and gradients against finite differences."""
-
 import math
 
 import pytest

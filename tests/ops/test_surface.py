@@ -1,5 +1,3 @@
-"""Expected, median and top depth and normals: the float64 reference, values by hand, and laws."""
-
 from typing import Any
 
 import pytest

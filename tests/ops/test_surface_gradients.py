@@ -1,5 +1,3 @@
-"""Gradients of depths and normals: the float64 reference, differences, values by hand, and laws."""
-
 import functools
 import importlib
 from typing import Any

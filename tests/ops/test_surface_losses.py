@@ -1,5 +1,3 @@
-"""The losses of the surface: values by hand, gradients by differences, when they start, and what they cost unused."""
-
 import dataclasses
 
 import pytest

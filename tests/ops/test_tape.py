@@ -1,5 +1,3 @@
-"""A Warp-only program differentiates a whole render with `tape.backward()`, and agrees with torch's gradients."""
-
 import torch
 import warp as wp
 

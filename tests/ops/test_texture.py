@@ -1,5 +1,3 @@
-"""Textured colours are those of the float64 reference; what is not a number, or does not fit, is not hidden."""
-
 import functools
 import math
 from typing import Any

@@ -1,5 +1,3 @@
-"""Results do not depend on the number of threads; blended errors are what they say."""
-
 import pytest
 import torch
 

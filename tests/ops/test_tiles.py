@@ -1,5 +1,3 @@
-"""Tile lists: what is listed, in which order, and what happens when there is no room for all of it."""
-
 import itertools
 
 import pytest

@@ -1,5 +1,3 @@
-"""Rendering inside of torch's modes and transforms: the table of docs/python.md."""
-
 import copy
 from collections.abc import Callable, Iterator
 

@@ -87,7 +87,6 @@ def _noise(*channels: int, most: int = 256, dtype: type = np.uint8) -> Image.Ima
 
 
 def _scene(folder: Path) -> Path:
-    """A scene of three photos."""
     return write_demo(folder, WIDTH, HEIGHT, VIEWS, points=6)
 
 

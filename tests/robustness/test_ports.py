@@ -21,7 +21,6 @@ Place = tuple[str, int]  # address and port
 
 
 def listening(command: psutil.Process) -> set[Place]:
-    """Places at which a command and its processes listen."""
     places = set[Place]()
     for process in (command, *command.children(recursive=True)):
         with suppress(psutil.NoSuchProcess, psutil.AccessDenied):  # it has ended

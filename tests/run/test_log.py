@@ -1,5 +1,3 @@
-"""The log of a training: lines are what the steps were, cost nothing in between, and go on when a run is resumed."""
-
 import dataclasses
 import json
 import math

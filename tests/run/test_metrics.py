@@ -1,5 +1,3 @@
-"""The metrics against scikit-image, hand-computed cases and their stated convention."""
-
 import math
 import sys
 import warnings

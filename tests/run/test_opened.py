@@ -1,5 +1,3 @@
-"""Models that Python saved open in view, render, export, info and eval, with or without a run around them."""
-
 import json
 import math
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""What a finished run gives, driven from the command line: pictures, paths, videos, passes, files for others."""
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,5 +1,3 @@
-"""One training or evaluation at a time writes to a run folder; a dead one holds nothing."""
-
 import errno
 import fcntl
 import os

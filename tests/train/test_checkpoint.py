@@ -1,5 +1,3 @@
-"""Checkpoints: what comes back is what went in, and a kill at any moment loses no whole one."""
-
 import os
 import random
 from pathlib import Path

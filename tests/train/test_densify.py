@@ -1,5 +1,3 @@
-"""Density control: how a surfel is split, which ones are, what is pruned, and what becomes of Adam's moments."""
-
 import dataclasses
 import math
 from pathlib import Path

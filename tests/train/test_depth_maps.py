@@ -1,5 +1,3 @@
-"""Depth maps in training: the bits of a training without them, one kind of step for all photos, and any scale."""
-
 import dataclasses
 import sys
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Training steps as CUDA graphs: the bits of launched steps, whatever changes on the way; launches where one fails."""
-
 import dataclasses
 import subprocess
 import sys
@@ -45,7 +43,6 @@ def graphs_of(trainer: Trainer) -> int:
 
 
 def half(view: View) -> View:
-    """A view of the left half of the photo."""
     camera, width = view.camera, view.camera.width // 2
     small = Camera(camera.viewmat, camera.K, width, camera.height, near=camera.near)
     return dataclasses.replace(view, camera=small, image=view.image[:, :width].contiguous())

@@ -1,5 +1,3 @@
-"""Numbers that are not finite are found and named; memory that does not suffice."""
-
 import dataclasses
 import json
 import math

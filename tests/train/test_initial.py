@@ -1,5 +1,3 @@
-"""A training starts with a texture and surfels that fit its scene."""
-
 import dataclasses
 import math
 

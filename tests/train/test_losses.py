@@ -1,5 +1,3 @@
-"""The losses against hand-computed cases, the paper's sums written out, and finite differences."""
-
 import math
 from typing import Any
 

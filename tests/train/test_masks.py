@@ -1,5 +1,3 @@
-"""What training makes of backgrounds and masks."""
-
 import dataclasses
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""Several ranks train one model: on CPUs, over gloo, in 2 and 3 processes."""
-
 import dataclasses
 import itertools
 import json
@@ -53,7 +51,6 @@ OFTEN_SAVED = [*TRAIN, "--checkpoint-every", "2"]
 
 
 def long_config(size: int, steps: int) -> Config:
-    """Rounds of density control."""
     return small(iterations=steps * size, max_surfels=200, densify=DensifyConfig(every=1000, start=1000))
 
 

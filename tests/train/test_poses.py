@@ -1,5 +1,3 @@
-"""Pose refinement: the motions, the gauge, that a run can stop and go on, and that disturbed poses come back."""
-
 import dataclasses
 import json
 from typing import Any

@@ -1,5 +1,3 @@
-"""`nexwarp train --gpus N` and `torchrun`: whole commands, in processes of their own."""
-
 import json
 import os
 import shutil

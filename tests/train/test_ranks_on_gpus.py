@@ -1,5 +1,3 @@
-"""Several ranks on GPUs: NCCL inside a CUDA graph and beside it, gloo beside it, and the end of a rank."""
-
 import json
 import os
 import signal

@@ -1,5 +1,3 @@
-"""Settings: presets have their numbers, --set takes and refuses, and what a run keeps and --resume makes of it."""
-
 import dataclasses
 import json
 from pathlib import Path

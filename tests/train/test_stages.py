@@ -1,5 +1,3 @@
-"""Runs that train teachers of their own first: how they are divided, and that they are what three commands give."""
-
 import dataclasses
 import json
 import shutil

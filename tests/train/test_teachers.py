@@ -1,5 +1,3 @@
-"""Training that also learns from teachers: what its steps compare with, ranks, resuming, errors, the benchmark."""
-
 import dataclasses
 import json
 import shutil

@@ -1,5 +1,3 @@
-"""Training: the laws of the loop and its schedules, and that it learns."""
-
 import dataclasses
 import gc
 import itertools

@@ -1,5 +1,3 @@
-"""Training from Python: the bits of the command line, own losses, callbacks, scenes in memory."""
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""Trainings that start from surfels of a file, or from a model."""
-
 import dataclasses
 import json
 from pathlib import Path

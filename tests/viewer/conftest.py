@@ -24,7 +24,6 @@ def camera() -> nw.Camera:
 
 @pytest.fixture(scope="module")
 def run(tiny_folder, tmp_path_factory, small_preset) -> Path:
-    """A tiny finished run."""
     folder = tmp_path_factory.mktemp("viewer") / "run"
     assert cli.main(["train", str(tiny_folder), "--run", str(folder), *FLAGS]) == 0
     return folder

@@ -82,7 +82,6 @@ class Client:
             yield from data["messages"]
 
     def picture(self) -> np.ndarray:
-        """The next picture."""
         for message in self.hear():
             if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
                 return np.asarray(Image.open(io.BytesIO(message["rgb_data"])))

@@ -1,5 +1,3 @@
-"""Who may open the viewer: Host, Origin and token, by the rules and against a running server."""
-
 import http.client
 from urllib.parse import urlsplit
 

@@ -1,5 +1,3 @@
-"""What one client may cost: the size of pictures and messages is bounded, and the other clients go on."""
-
 import gc
 import math
 import os

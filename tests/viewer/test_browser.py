@@ -1,5 +1,3 @@
-"""The viewer in a browser."""
-
 import io
 import shutil
 import time

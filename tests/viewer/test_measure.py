@@ -1,5 +1,3 @@
-"""Points that a client clicks: where they lie, and what is said of them."""
-
 import asyncio
 import math
 from types import SimpleNamespace

@@ -1,5 +1,3 @@
-"""The viewer's pace, its cameras, and the editor of camera paths."""
-
 import asyncio
 import math
 

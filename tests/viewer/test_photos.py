@@ -1,5 +1,3 @@
-"""The list of photos: what is read of photos.csv, and what the panel shows."""
-
 import numpy as np
 import pytest
 

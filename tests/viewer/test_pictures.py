@@ -1,5 +1,3 @@
-"""What the viewer draws: every mode is what the buffers hold, in bands, at any exposure."""
-
 import math
 from collections.abc import Sequence
 

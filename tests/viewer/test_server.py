@@ -1,5 +1,3 @@
-"""The server: what clients get, and what invalid messages they may send."""
-
 import math
 import shutil
 import socket

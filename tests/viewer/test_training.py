@@ -1,5 +1,3 @@
-"""A viewer beside a training changes nothing of it and costs little."""
-
 import functools
 import math
 import threading

@@ -70,7 +70,6 @@ def wall_points(count: int = 600, seed: int = 0) -> np.ndarray:
 
 
 def save_png(file: Path, photo: np.ndarray) -> None:
-    """Write a photo as a PNG file."""
     Image.fromarray(photo).save(file)
 
 
@@ -128,7 +127,6 @@ def transforms(names: Sequence[str], applied: np.ndarray | None = None, **keys: 
 
 
 def write_transforms(path: Path, data: dict[str, object]) -> Path:
-    """Write a transforms.json."""
     path.mkdir(parents=True, exist_ok=True)
     (path / "transforms.json").write_text(json.dumps(data))
     return path

@@ -1,5 +1,3 @@
-"""Bad scenes are one clear line."""
-
 import json
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""One scene is the same in every format."""
-
 import numpy as np
 import pytest
 import torch

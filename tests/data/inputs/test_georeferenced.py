@@ -1,5 +1,3 @@
-"""Scenes with world coordinates of millions keep their pixels, from reading to export."""
-
 import json
 
 import numpy as np

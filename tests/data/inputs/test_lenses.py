@@ -1,5 +1,3 @@
-"""Photos of other lenses are undistorted."""
-
 from typing import Any
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Masks: what they leave out, in every format and size."""
-
 import numpy as np
 import pytest
 from PIL import Image

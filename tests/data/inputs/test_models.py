@@ -1,5 +1,3 @@
-"""COLMAP models as programs and editors write them give the cameras and points of the model that they came from."""
-
 import re
 import shutil
 import unicodedata

@@ -1,5 +1,3 @@
-"""Photos of every file format, number type and orientation: their stored pixels, or one line."""
-
 import struct
 import zlib
 from collections.abc import Callable

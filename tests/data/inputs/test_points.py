@@ -1,5 +1,3 @@
-"""Points of every number type, byte order and place: their colours are those of the walls that they lie on."""
-
 import codecs
 from functools import partial
 

@@ -1,5 +1,3 @@
-"""Many points, memory, and progress."""
-
 import pytest
 import torch
 

@@ -1,5 +1,3 @@
-"""A transforms.json in the words of other programs, and what is refused; the photos are of a painted room."""
-
 import json
 import math
 import unicodedata

@@ -1,5 +1,3 @@
-"""Transparent photos, their backgrounds, and random points where a scene has none."""
-
 import numpy as np
 import pytest
 import torch
