@@ -17,7 +17,7 @@ from torch.nn.functional import conv2d, max_pool2d, normalize
 from nexwarp.data import View
 from nexwarp.errors import FormatError, MissingError, SettingError
 from nexwarp.io.files import check_tensors_header, one_line
-from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
+from nexwarp.io.pictures import error_map, png_files, side_by_side, to_uint8
 from nexwarp.model.model import Model
 from nexwarp.ops.ssim import ssim_map
 from nexwarp.run.folder import COMPARE, TEST, picture_name
@@ -84,19 +84,21 @@ def evaluate(
         raise ValueError(f"metrics: expected some of {', '.join(METRICS)}, got {unknown[0]!r}")
     ranks = Ranks.alone(model.device) if ranks is None else ranks
     results: dict[str, Values] = {}
-    for begin in range(0, len(views), ranks.size):
-        group = views[begin : begin + ranks.size]
-        mine = _judge(model, group[ranks.rank], mask_mode, metrics) if ranks.rank < len(group) else None
-        for view, (picture, values) in zip(group, _gathered(mine, group, ranks), strict=True):
-            results[view.name] = values
-            if renders is not None and ranks.first:
-                photo, mask = compared(model, view, mask_mode)
-                captions = ["photo", f"render {psnr(picture, photo, mask):.2f} dB", "error (0 to 0.25)"]
-                strip = side_by_side([photo, picture, error_map(picture, photo)], captions=captions)
-                save_png(renders / TEST / picture_name(view.name), picture)
-                save_png(renders / COMPARE / picture_name(view.name), strip)
-            if progress is not None:
-                progress(view.name)
+    with png_files() as save:
+        for begin in range(0, len(views), ranks.size):
+            group = views[begin : begin + ranks.size]
+            mine = _judge(model, group[ranks.rank], mask_mode, metrics) if ranks.rank < len(group) else None
+            for view, (picture, values) in zip(group, _gathered(mine, group, ranks), strict=True):
+                results[view.name] = values
+                if renders is not None and ranks.first:
+                    photo, mask = compared(model, view, mask_mode)
+                    quality = values["psnr"] if "psnr" in values else psnr(picture, photo, mask)
+                    captions = ["photo", f"render {quality:.2f} dB", "error (0 to 0.25)"]
+                    strip = side_by_side([photo, picture, error_map(picture, photo)], captions=captions)
+                    save(renders / TEST / picture_name(view.name), picture)
+                    save(renders / COMPARE / picture_name(view.name), strip)
+                if progress is not None:
+                    progress(view.name)
     summary: dict[str, Any] = {"views": results, "convention": CONVENTION}
     for name in metrics:
         known = [value for values in results.values() if (value := values[name]) is not None]

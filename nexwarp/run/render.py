@@ -19,7 +19,7 @@ from nexwarp.cameras.ray_camera import MAX_SIDE, RayCamera
 from nexwarp.cameras.similarity import IDENTITY, Similarity
 from nexwarp.data.option import Flag_, option
 from nexwarp.errors import RunError, SettingError
-from nexwarp.io.pictures import linear_light, save_exr, save_png, to_uint8
+from nexwarp.io.pictures import linear_light, png_files, save_exr, to_uint8
 from nexwarp.io.video import check_video, video_writer
 from nexwarp.model.buffers import render_buffers, save_buffers
 from nexwarp.model.edit import moved_buffers
@@ -234,7 +234,7 @@ class RenderJob:
 
     @torch.no_grad()
     def render(self, model: Model, done: Callable[[], object] = lambda: None) -> None:
-        """Render and write all images and the video, and call `done` after each. An incomplete video is deleted."""
+        """Render all images, call `done` after each, and write them and the video. An incomplete video is deleted."""
         frames = [picture for picture in self.pictures if picture.is_frame]
         asked = {"exposure": self.order.exposure, "order": self.order.order}
         changes = cast(RenderChanges, {name: value for name, value in asked.items() if value is not None})
@@ -244,6 +244,7 @@ class RenderJob:
             if self.order.video is not None:  # before any rendering, which would be lost if it cannot be written
                 size = (frames[0].camera.width, frames[0].camera.height)
                 append = stack.enter_context(video_writer(self.order.video, *size, self.fps))
+            save = stack.enter_context(png_files())
             for picture in self.pictures:
                 if picture.buffers:
                     buffers = render_buffers(model, picture.camera, **changes)
@@ -253,7 +254,7 @@ class RenderJob:
                     image = model.render(projected(self.order, picture.camera), **changes).image
                 pixels = to_uint8(image).cpu()
                 if self.order.format == "png":
-                    save_png(picture.file, pixels)
+                    save(picture.file, pixels)
                 else:
                     light = linear_light(image.cpu().clamp_min(0)) * white
                     save_exr(picture.file.with_suffix(".exr"), {"image": light})

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
+from nexwarp.io.pictures import THREADS, error_map, png_files, save_png, side_by_side, to_uint8
 from tests.cli.support import picture
 
 
@@ -16,6 +16,25 @@ def test_png_returns_what_was_saved(tmp_path: Path, device: torch.device) -> Non
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["a.png"]
     with pytest.raises(ValueError, match=r"image: expected shape \(H, W, 3\), got \(7, 9\)"):
         save_png(tmp_path / "b.png", image[..., 0])
+
+
+def test_pictures_compressed_in_threads_are_written_in_order_until_one_cannot_be(tmp_path: Path) -> None:
+    images = [torch.rand(7, 9, 3) for _ in range(5 * THREADS)]
+    files = [tmp_path / f"{index}.png" for index in range(len(images))]
+    with png_files() as save:
+        for file, image in zip(files, images, strict=True):
+            save(file, image)
+    assert all(picture(file).equal(to_uint8(image)) for file, image in zip(files, images, strict=True))
+    files[3].unlink()
+    files[3].mkdir()
+    before = files[4].read_bytes()
+    saved = 0
+    with pytest.raises(IsADirectoryError, match=r"3\.png"), png_files() as save:
+        for file, image in zip(files, images, strict=True):
+            save(file, 1 - image)
+            saved += 1
+    assert saved < 4 + 2 * THREADS and files[4].read_bytes() == before, "nothing is written after an error"
+    assert picture(files[2]).equal(to_uint8(1 - images[2])) and sorted(tmp_path.iterdir()) == sorted(files)
 
 
 def test_error_map_runs_from_violet_to_yellow_at_a_quarter() -> None:
