@@ -1,12 +1,13 @@
 """Hit points and ray directions in the world frame, for the texturing pass (paper Sec. 4.2).
 
-A thread is a pixel. Read: depths (P, K) and the world-to-camera matrix. Written: for a hit at z-depth t the point
-origin + t * R^T d, and for a pixel the direction R^T d, unit, for the textured colour's SH; backward, the gradients of
-depths and, a pixel, of the matrix.
+A thread is a pixel. Read: depths (P, K), factors on them (or a null array) and the world-to-camera matrix. Written: for
+a hit at z-depth t the point origin + t * R^T d, and for a pixel the direction R^T d, unit, for the textured colour's
+SH; backward, the gradients of depths and, a pixel, of the matrix.
 """
 
 import functools
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -33,6 +34,13 @@ def position_dot(viewmat: Mat44, point: Vec3, grad: Vec3):
     return wp.dot(rotate_back(viewmat, point - translation(viewmat)), grad)
 
 
+@wp.func
+def factor(factors: wp.array2d(dtype=Any), p: int, h: int):
+    if factors:
+        return factors[p, h]
+    return factors.dtype(1.0)
+
+
 @functools.cache
 def unproject_kernels(real: type) -> SimpleNamespace:
     """Make the kernel and its derivative."""
@@ -43,6 +51,7 @@ def unproject_kernels(real: type) -> SimpleNamespace:
     def unproject(
         first: wp.int32,
         depths: wp.array2d(dtype=real),
+        factors: wp.array2d(dtype=real),
         viewmats: wp.array(dtype=mat44),
         Ks: wp.array(dtype=mat33),
         width: wp.int32,
@@ -56,12 +65,13 @@ def unproject_kernels(real: type) -> SimpleNamespace:
         origin = -rotate_back(viewmat, translation(viewmat))
         directions[p] = wp.normalize(ray)
         for h in range(depths.shape[1]):
-            positions[p, h] = origin + ray * depths[p, h]
+            positions[p, h] = origin + ray * (depths[p, h] * factor(factors, p, h))
 
     @wp.kernel(enable_backward=False, module="unique")
     def unproject_backward(  # noqa: PLR0913  # a kernel entry point
         first: wp.int32,
         depths: wp.array2d(dtype=real),
+        factors: wp.array2d(dtype=real),
         viewmats: wp.array(dtype=mat44),
         Ks: wp.array(dtype=mat33),
         width: wp.int32,
@@ -84,9 +94,10 @@ def unproject_kernels(real: type) -> SimpleNamespace:
             if grad_positions:
                 grad = grad_positions[p, h]
             if grad_depths:
-                grad_depths[p, h] = wp.dot(ray, grad)
+                grad_depths[p, h] = wp.dot(ray, grad) * factor(factors, p, h)
             if grad_viewmats:
-                of_position, _p, _h = wp.grad(position_dot)(viewmat, d * depths[p, h], grad)
+                point = d * (depths[p, h] * factor(factors, p, h))
+                of_position, _p, _h = wp.grad(position_dot)(viewmat, point, grad)
                 grad_viewmat += of_position
         if grad_viewmats:
             grad_viewmats[p] = grad_viewmat

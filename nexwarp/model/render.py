@@ -294,8 +294,8 @@ def _texels(
     jitter: torch.Tensor | None,
 ) -> torch.Tensor:
     """Return the textured colours (H, W, K, 3) of the hits."""
-    shifted = hits.depths if jitter is None else hits.depths * jitter
-    positions, directions = ops.unproject(shifted, camera.viewmat, pinhole_of(camera, shifted))
+    pinhole = pinhole_of(camera, hits.depths)
+    positions, directions = ops.unproject(hits.depths, camera.viewmat, pinhole, jitter)
     found = Hits(hits.ids, hits.depths, hits.weights, hits.plain, hits.alpha, positions, directions)
     if not isinstance(texture, NeuralTexture):
         colors = texture.colors(found, camera)

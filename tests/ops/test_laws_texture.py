@@ -4,8 +4,9 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp import ops
 from nexwarp.machine import deterministic
-from nexwarp.model.render import jitter_factors
+from nexwarp.model.render import jitter_factors, pinhole_of
 from tests.render_support import MAX_HITS, assert_alike, assert_same, draw
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
@@ -64,6 +65,22 @@ def test_jitter_moves_lookups_along_their_rays(jitter, device, monkeypatch):
     assert not torch.equal(draw(scene, texture, jitter=other).textured, moved.textured)
     with pytest.raises(ValueError, match=r"^jitter: expected shape"):
         draw(scene, texture, jitter=torch.ones(2, 3, dtype=factors.dtype, device=device))
+
+
+def test_factors_on_depths_are_those_of_their_products(device: torch.device) -> None:
+    """With the gradients, of which those of points may have rows that lie apart, as the texture's do."""
+    camera = make_camera(random_scene(width=9, height=7, device=device))
+    given = [2 + torch.rand(7, 9, 2, dtype=torch.float64, device=device), camera.viewmat.detach().double()]
+    factors, signal = (torch.rand(7, 9, 2, *x, dtype=torch.float64, device=device) for x in ((), (4,)))
+    found = []
+    for inside in (False, True):
+        depths, viewmat = (x.clone().requires_grad_() for x in given)
+        arguments = (depths, factors) if inside else (depths * factors, None)
+        points, _ = ops.unproject(arguments[0], viewmat, pinhole_of(camera, viewmat), arguments[1])
+        rows = signal[..., :3] if inside else signal[..., :3].contiguous()
+        found.append([points, *torch.autograd.grad(points, [depths, viewmat], rows)])
+    for name, one, other in zip(("points", "depths", "viewmat"), *found, strict=True):
+        assert_close(other, one, kind="gradient", name=name)
 
 
 def test_pictures_without_textured_hits_have_gradients(device: torch.device) -> None:
