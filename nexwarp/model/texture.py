@@ -326,7 +326,8 @@ class NeuralTexture(Texture):
         else:
             focal = self.grid.new_full((1,), float(focal))
         table = self.half_copy() if self._in_half() and self._half_copy is not None else None
-        weights = [*hidden, last[: 3 * (degree + 1) ** 2]]
+        # The derivative of a slice, even of all, would copy it into zeros.
+        weights = [*hidden, last if degree == self.sh_degree else last[: 3 * (degree + 1) ** 2]]
         field = ops.Field(self.grid, weights, self.resolutions.to(self.grid.dtype), self._in_half(), table)
         return ops.texture(ops.Points(positions, depths, focal), field, rays)
 

@@ -206,13 +206,17 @@ class _Collect(torch.autograd.Function):
         ctx.save_for_backward(*outputs)
         ctx.rest = (scene, request)
         ctx.mark_non_differentiable(ids, stops)
+        ctx.set_materialize_grads(False)
         return outputs
 
     @staticmethod
     @first_derivative
-    def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        scene, request = ctx.rest
-        grad_records, errors, grad_channels = _backward(scene, ctx.saved_tensors, grads, request.errors)
+    def backward(ctx: Context, *given: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+        (scene, request), outputs = ctx.rest, ctx.saved_tensors
+        # Zeros for what nothing depends on, unlike torch's own not for integers.
+        missing = [g is None and x is not None and x.is_floating_point() for g, x in zip(given, outputs, strict=True)]
+        grads = tuple(torch.zeros_like(x) if m else g for m, g, x in zip(missing, given, outputs, strict=True))
+        grad_records, errors, grad_channels = _backward(scene, outputs, grads, request.errors)
         if errors is not None:
             request.sums_after_backward = errors
         return grad_records, grad_channels, None, None, None
