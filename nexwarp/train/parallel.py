@@ -122,9 +122,6 @@ class ParallelTrainer(Trainer):
             # The other ranks have part of the step: it cannot be repeated here.
             raise UpdateError(f"out of memory while gradients were sent: needed {needed}", needed) from None
 
-    def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
-        return loss * self.share
-
     def _update(self, errors: torch.Tensor | None) -> Gradients | None:
         if self.beside:
             return Gradients([x.grad for x in self._trained()], errors)

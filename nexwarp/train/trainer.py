@@ -3,7 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping
-from functools import cached_property, partial, reduce
+from functools import cached_property, partial
 from pathlib import Path
 
 import torch
@@ -38,6 +38,7 @@ class Trainer(TrainingState):
         exposures: of the training photos; None where they have one exposure.
         graphs: CUDA graphs of steps; None where steps are launched kernel by kernel.
         views_a_step: number of views of the last step: 1, or that of the ranks.
+        share: factor of the gradients: 1, or this rank's share in the mean over these views.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class Trainer(TrainingState):
             else TargetSource(self, calibration)
         )
         self.views, self.background = self.targets.views, self.targets.background
-        self.views_a_step = 1
+        self.views_a_step, self.share = 1, 1.0
         self.noted: list[tuple[int, str, torch.Tensor]] = []  # losses since the last check
 
     def run(self, observe: Callable[[StepReport], None] | None = None, until: int | None = None) -> None:
@@ -155,7 +156,9 @@ class Trainer(TrainingState):
                 errors = (image - target.photo).abs().mean(dim=-1)
                 request = out.request_splat_error(errors if target.counts is None else errors * target.counts)
             del out, taken  # so that what the backward pass does not need is freed
-            self._weighted(reduce(torch.add, losses.values())).backward()
+            terms = [x for x in losses.values() if x.requires_grad]
+            # The gradient of their sum, without adding them up.
+            torch.autograd.backward(terms if self.share == 1 else [x * self.share for x in terms])
             gradients = self._update(None if request is None else request.sums_after_backward)
         finally:
             self.optimizer.zero_grad(set_to_none=True)
@@ -164,9 +167,6 @@ class Trainer(TrainingState):
         if gradients is None:
             losses |= self.take_grid_loss()
         return StepResult(losses, image, room, gradients)
-
-    def _weighted(self, loss: torch.Tensor) -> torch.Tensor:
-        return loss
 
     def _update(self, errors: torch.Tensor | None) -> Gradients | None:
         """Update the parameters by their gradients, and the densifier's sums by the errors (N,) of the step's view."""
