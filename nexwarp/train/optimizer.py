@@ -155,10 +155,12 @@ def rate_ends(config: Config, scale: float) -> dict[str, tuple[float, float]]:
 def set_rates(optimizer: torch.optim.Optimizer, iteration: int, iterations: int) -> None:
     """Set the rates of a step, counted from 1: log-linear between the ends of each group."""
     progress = (iteration - 1) / max(iterations - 1, 1)
-    for group in optimizer.param_groups:
-        first, last = group["ends"]
-        rate = math.exp((1 - progress) * math.log(first) + progress * math.log(last)) if first else 0.0
-        if isinstance(group["lr"], torch.Tensor):
-            group["lr"].fill_(rate)
-        else:
+    groups, ends = optimizer.param_groups, [group["ends"] for group in optimizer.param_groups]
+    rates = [math.exp((1 - progress) * math.log(a) + progress * math.log(b)) if a else 0.0 for a, b in ends]
+    if isinstance(groups[0]["lr"], torch.Tensor):  # two kernels, however many groups there are
+        held = [group["lr"] for group in groups]
+        torch._foreach_zero_(held)
+        torch._foreach_add_(held, rates)
+    else:
+        for group, rate in zip(groups, rates, strict=True):
             group["lr"] = rate

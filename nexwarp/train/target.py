@@ -46,7 +46,7 @@ class Target:
     Attributes:
         camera: the camera that the step renders.
         photo: (H, W, 3) float in [0, 1], the photo.
-        background: three numbers or a (3,) tensor, the colour behind everything in this step.
+        background: (3,) float32, the colour behind everything in this step.
         exposure: (3,) or (H, W, 3), the photo's gains times the lens's falloff; None is the mean exposure.
         counts: (H, W) bool, where the photo counts; None is everywhere.
         empty: (H, W) bool, where there is nothing but the background; None is nowhere.
@@ -98,7 +98,7 @@ class TargetSource:
         gains, lens = (None, None) if calibration is None else (calibration.gains, calibration.exposures)
         self.views = TrainingViews(self.scene.train, state.device, gains, lens)
         self.background = self.config.background or self.scene.background or mean_color(self.scene.train, calibration)
-        self.background_tensor = torch.tensor(self.background, device=state.device)
+        self.background_tensor = torch.tensor(self.background, dtype=torch.float32, device=state.device)
         self.generator, self.noise = state.generator, state.noise
         self.teachers: list[Model] = []
         self.points: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
@@ -126,19 +126,18 @@ class TargetSource:
     def from_view(self, index: int, upcoming: Sequence[int] = ()) -> Target:
         """Make the target of a view: photo, background and mask."""
         camera, photo = self.views.get(index, upcoming)
-        background: Color = self.background
-        behind = self.background_tensor
+        background = self.background_tensor
         if self.scene.random_background:
             drawn = torch.rand(3, generator=self.generator)
-            background = behind = drawn.to(self.views.device, non_blocking=True)
+            background = drawn.to(self.views.device, non_blocking=True)
             alpha = self.views.alpha(index)
             if alpha is not None:
-                photo = photo + (1 - alpha)[..., None] * (behind - self.background_tensor)
+                photo = photo + (1 - alpha)[..., None] * (background - self.background_tensor)
         mask = self.views.mask(index)
         exposure = self.views.exposure(index)
         if mask is None or self.config.mask_mode == "ignore":
             return Target(camera, photo, background, exposure, counts=mask)
-        return Target(camera, torch.where(mask[..., None], photo, behind), background, exposure, empty=~mask)
+        return Target(camera, torch.where(mask[..., None], photo, background), background, exposure, empty=~mask)
 
     def with_points(self, target: Target, index: int) -> Target:
         """Add the points of view `index` to its target, where it has any and the depth loss counts."""
@@ -153,12 +152,13 @@ class TargetSource:
                 seen = moved.project(points.to(device))
             visible = visible_points(*seen, camera.width, camera.height, mask)
             none = torch.zeros(0, dtype=torch.int64, device=device), torch.zeros(0, device=device)
-            self.points[index] = none if visible is None else visible
+            places, expected = none if visible is None else visible
+            # On CUDA, as many for every view, so that one graph serves all of them. Steps that are not captured pad
+            # too: sums of other lengths are rounded differently.
+            fill = self._most_points - len(places) if device.type == "cuda" else 0
+            pad = torch.nn.functional.pad
+            self.points[index] = pad(places, (0, fill)), pad(expected, (0, fill))
         places, expected = self.points[index]
-        # On CUDA, as many for every view, so that one graph serves all of them. Steps that are not captured pad too:
-        # sums of other lengths are rounded differently.
-        fill = self._most_points - len(places) if device.type == "cuda" else 0
-        places, expected = (torch.nn.functional.pad(x, (0, fill)) for x in (places, expected))
         return dataclasses.replace(target, places=places, expected=expected)
 
     def with_depth(self, target: Target, index: int) -> Target:
@@ -335,7 +335,7 @@ class TrainingViews:
         """Return camera and photo (H, W, 3) float in [0, 1] of a view; copy those of the next views, `ahead`."""
         photo = self._on_device(index)
         self._fetch(ahead[:AHEAD])
-        return self.cameras[index], photo.float() / 255.0
+        return self.cameras[index], photo / 255.0
 
     def exposure(self, index: int) -> torch.Tensor | None:
         """Return gains times falloff of a photo, (3,) or (H, W, 3); None where photos have one exposure."""

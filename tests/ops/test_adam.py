@@ -5,7 +5,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.ops.adam import Moments, adam_step
-from nexwarp.train.optimizer import FusedAdam, grid_factors
+from nexwarp.train.optimizer import FusedAdam, grid_factors, set_rates
 from nexwarp.train.recipe import LossWeights
 from tests.tolerances import assert_close
 
@@ -108,3 +108,22 @@ def test_grids_of_any_size_are_regularised(shape: tuple[int, int, int], device: 
     assert_close(moments.mean, 0.1 * grad, kind="value", name="mean")
     assert_close(moments.square, 0.001 * grad.square(), kind="value", name="square")
     assert_close(ours, theirs - 0.1 * grad.sign(), kind="value", name="grid")
+
+
+def test_rates_in_tensors_are_the_same_numbers(device: torch.device) -> None:
+    """As a CUDA graph reads them: in the tensors that the groups have."""
+    ends = [(1e-3, 1e-5), (0.0, 0.0), (0.5, 0.5)]
+    leaves = [torch.zeros(1, device=device, requires_grad=True) for _ in ends]
+    numbers, tensors = (
+        torch.optim.SGD([{"params": [x], "lr": rate, "ends": end} for x, end in zip(leaves, ends, strict=True)])
+        for rate in (1.0, torch.tensor(1.0, device=device))
+    )
+    for group in tensors.param_groups:
+        group["lr"] = group["lr"].clone()
+    held = [group["lr"] for group in tensors.param_groups]
+    for iteration in (1, 7, 30):
+        for optimizer in (numbers, tensors):
+            set_rates(optimizer, iteration, 30)
+        expected = [group["lr"] for group in numbers.param_groups]
+        assert torch.equal(torch.stack(held).cpu(), torch.tensor(expected))
+    assert expected == pytest.approx([last for _, last in ends])
