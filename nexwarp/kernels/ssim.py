@@ -13,7 +13,6 @@ either side, down the rows; the result goes to shared memory, from where a threa
 along a row; and what comes of that goes through shared memory again, so that neighbouring threads write neighbours.
 """
 
-import functools
 import math
 
 import warp as wp
@@ -25,7 +24,9 @@ C2 = 0.03**2
 REACH = WINDOW_SIZE // 2
 _GAUSSIAN = [math.exp(-((i - REACH) ** 2) / (2.0 * WINDOW_SIGMA**2)) for i in range(WINDOW_SIZE)]
 
-PIXELS, ROWS, GROUP = 64, 8, 8
+PIXELS, ROWS = 64, 8
+GROUP = ROWS
+READ = ROWS + 2 * REACH
 COLUMNS = 3 * PIXELS
 # Columns that are read, and what fills up the last warp.
 THREADS = 224
@@ -57,6 +58,26 @@ _SYNC = """
 """
 
 
+# With wp.static of a loop's number, Warp would generate a kernel's code at each start, to hash it.
+_SPREAD = f"""
+    constexpr float taps[] = {{{", ".join(f"{tap(i)!r}f" for i in range(WINDOW_SIZE))}}};
+    #pragma unroll
+    for (int at = 0; at < {ROWS}; ++at)
+        if (i - at >= 0 && i - at < {WINDOW_SIZE}) sums.c[at] += x * taps[i - at];
+    return sums;
+"""
+Sums = wp.types.vector(length=ROWS, dtype=wp.float32)
+
+
+@wp.func_native(_SPREAD)
+def spread(i: wp.int32, x: wp.float32, sums: Sums) -> Sums:
+    """Add a value's part, i - REACH places from the first of neighbours, to the sums of their windows.
+
+    i is a constant, so that the weights are, too.
+    """
+    ...
+
+
 @wp.func_native(_CELL)
 def cell(write: wp.bool, at: wp.int32, x: wp.float32) -> wp.float32:
     """Write to one of the block's cells, or read it."""
@@ -74,8 +95,6 @@ def blocks_of(height: int, width: int) -> int:
     return -(-width // COLUMNS) * -(-height // ROWS)
 
 
-Rows = wp.types.vector(length=ROWS, dtype=wp.float32)
-Group = wp.types.vector(length=GROUP, dtype=wp.float32)
 HALF_C1, HALF_C2 = wp.constant(C1 / 2.0), wp.constant(C2 / 2.0)
 
 
@@ -88,14 +107,14 @@ def place(thread: wp.int32, width: wp.int32):
 
 
 @wp.func
-def put(plane: wp.int32, lane: wp.int32, values: Rows):
+def put(plane: wp.int32, lane: wp.int32, values: Sums):
     """Share a column's values."""
     for j in range(wp.static(ROWS)):
         cell(True, (plane * ROWS + j) * THREADS + lane, values[j])
 
 
 @wp.func
-def put_group(plane: wp.int32, lane: wp.int32, values: Group):
+def put_group(plane: wp.int32, lane: wp.int32, values: Sums):
     """Share a group's values, at the columns that they are for."""
     for o in range(wp.static(GROUP)):
         cell(True, plane * wp.static(ROWS * THREADS) + group_start(lane) + 3 * o, values[o])
@@ -116,12 +135,9 @@ def group_column(lane: wp.int32):
 def blur(plane: wp.int32, lane: wp.int32):
     """Blur a thread's group of a plane along its row."""
     start = plane * wp.static(ROWS * THREADS) + group_start(lane)
-    sums = Group()
-    for i in range(wp.static(GROUP + 2 * REACH)):
-        x = cell(False, start + 3 * i, 0.0)
-        for o in range(wp.static(GROUP)):
-            if wp.static(tap(i - o) > 0.0):
-                sums[o] += x * wp.static(wp.float32(tap(i - o)))
+    sums = Sums()
+    for i in range(wp.static(READ)):
+        sums = spread(i, cell(False, start + 3 * i, 0.0), sums)
     return sums
 
 
@@ -159,148 +175,139 @@ def ssim(mx: wp.float32, my: wp.float32, q: wp.float32, p: wp.float32):
     return wp.vec4(s, (b - a) * inverse * my + (s / d - s / c) * mx, -s / d, a * inverse)
 
 
-@functools.cache
-def score_kernel() -> wp.Kernel:
-    """Make the kernel of the scores; decorating it hashes unrolled code, which takes half a second."""
-
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
-    def score(
-        first: wp.int32,
-        image: wp.array(dtype=wp.float32),
-        target: wp.array(dtype=wp.float32),
-        height: wp.int32,
-        width: wp.int32,
-        scale: wp.float32,
-        # outputs
-        losses: wp.array(dtype=wp.float32),
-        derivatives: wp.array2d(dtype=wp.float32),
-    ):
-        """Sums of (1 - s) scale, one a thread, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
-        thread = first + wp.tid()
-        at = place(thread, width)
-        lane = at[0]
-        column = at[1] - 3 * REACH + lane
-        mx = Rows()
-        my = Rows()
-        q = Rows()
-        p = Rows()
-        if column >= 0 and column < width:
-            for i in range(wp.static(ROWS + 2 * REACH)):
-                row = at[2] + i - REACH
-                x = float(0.0)
-                y = float(0.0)
-                if row >= 0 and row < height:
-                    x = image[row * width + column]
-                    y = target[row * width + column]
-                xy = x * y
-                square = 0.5 * (x * x + y * y)
-                for j in range(wp.static(ROWS)):
-                    if wp.static(tap(i - j) > 0.0):
-                        mx[j] += x * wp.static(wp.float32(tap(i - j)))
-                        my[j] += y * wp.static(wp.float32(tap(i - j)))
-                        q[j] += square * wp.static(wp.float32(tap(i - j)))
-                        p[j] += xy * wp.static(wp.float32(tap(i - j)))
-        put(0, lane, mx)
-        put(1, lane, my)
-        put(2, lane, q)
-        put(3, lane, p)
-        sync_block()
-        total = float(0.0)
-        ds_dmx = Group()
-        ds_dq = Group()
-        ds_dp = Group()
-        if lane < COLUMNS:
-            gx = blur(0, lane)
-            gy = blur(1, lane)
-            gq = blur(2, lane)
-            gp = blur(3, lane)
-            row = at[2] + lane // wp.static(COLUMNS // GROUP)
-            for o in range(wp.static(GROUP)):
-                s = ssim(gx[o], gy[o], gq[o], gp[o])
-                ds_dmx[o] = s[1]
-                ds_dq[o] = s[2]
-                ds_dp[o] = s[3]
-                if row < height and at[1] + group_column(lane) + 3 * o < width:
-                    total += (1.0 - s[0]) * scale
-        losses[thread] = total
-        if not derivatives:
-            return
-        sync_block()
-        if lane < COLUMNS:
-            put_group(0, lane, ds_dmx)
-            put_group(1, lane, ds_dq)
-            put_group(2, lane, ds_dp)
-        sync_block()
-        write_columns(derivatives, lane, at[1] + lane, at[2], height, width)
-
-    return score
+OPTIONS = {
+    "enable_backward": False,
+    "grid_stride": False,
+    "module": "unique",
+    "launch_bounds": THREADS,
+    "module_options": {"max_unroll": READ},
+}
 
 
-@functools.cache
-def gradient_kernel() -> wp.Kernel:
-    """Make the kernel of the gradient."""
+@wp.kernel(**OPTIONS)
+def score(
+    first: wp.int32,
+    image: wp.array(dtype=wp.float32),
+    target: wp.array(dtype=wp.float32),
+    height: wp.int32,
+    width: wp.int32,
+    scale: wp.float32,
+    # outputs
+    losses: wp.array(dtype=wp.float32),
+    derivatives: wp.array2d(dtype=wp.float32),
+):
+    """Sums of (1 - s) scale, one a thread, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
+    thread = first + wp.tid()
+    at = place(thread, width)
+    lane = at[0]
+    column = at[1] - 3 * REACH + lane
+    mx = Sums()
+    my = Sums()
+    q = Sums()
+    p = Sums()
+    if column >= 0 and column < width:
+        for i in range(wp.static(READ)):
+            row = at[2] + i - REACH
+            x = float(0.0)
+            y = float(0.0)
+            if row >= 0 and row < height:
+                x = image[row * width + column]
+                y = target[row * width + column]
+            mx = spread(i, x, mx)
+            my = spread(i, y, my)
+            q = spread(i, 0.5 * (x * x + y * y), q)
+            p = spread(i, x * y, p)
+    put(0, lane, mx)
+    put(1, lane, my)
+    put(2, lane, q)
+    put(3, lane, p)
+    sync_block()
+    total = float(0.0)
+    ds_dmx = Sums()
+    ds_dq = Sums()
+    ds_dp = Sums()
+    if lane < COLUMNS:
+        gx = blur(0, lane)
+        gy = blur(1, lane)
+        gq = blur(2, lane)
+        gp = blur(3, lane)
+        row = at[2] + lane // wp.static(COLUMNS // GROUP)
+        for o in range(wp.static(GROUP)):
+            s = ssim(gx[o], gy[o], gq[o], gp[o])
+            ds_dmx[o] = s[1]
+            ds_dq[o] = s[2]
+            ds_dp[o] = s[3]
+            if row < height and at[1] + group_column(lane) + 3 * o < width:
+                total += (1.0 - s[0]) * scale
+    losses[thread] = total
+    if not derivatives:
+        return
+    sync_block()
+    if lane < COLUMNS:
+        put_group(0, lane, ds_dmx)
+        put_group(1, lane, ds_dq)
+        put_group(2, lane, ds_dp)
+    sync_block()
+    write_columns(derivatives, lane, at[1] + lane, at[2], height, width)
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module="unique", launch_bounds=THREADS)
-    def gradient(  # noqa: PLR0913  # a kernel entry point
-        first: wp.int32,
-        derivatives: wp.array2d(dtype=wp.float32),
-        image: wp.array(dtype=wp.float32),
-        target: wp.array(dtype=wp.float32),
-        height: wp.int32,
-        width: wp.int32,
-        scale: wp.float32,
-        grad_loss: wp.array(dtype=wp.float32),
-        # outputs
-        grad_image: wp.array(dtype=wp.float32),
-    ):
-        at = place(first + wp.tid(), width)
-        lane = at[0]
-        column = at[1] - 3 * REACH + lane
-        dmx = Rows()
-        dq = Rows()
-        dp = Rows()
-        if column >= 0 and column < width:
-            for i in range(wp.static(ROWS + 2 * REACH)):
-                row = at[2] + i - REACH
-                x = float(0.0)
-                y = float(0.0)
-                z = float(0.0)
-                if row >= 0 and row < height:
-                    x = derivatives[0, row * width + column]
-                    y = derivatives[1, row * width + column]
-                    z = derivatives[2, row * width + column]
-                for j in range(wp.static(ROWS)):
-                    if wp.static(tap(i - j) > 0.0):
-                        dmx[j] += x * wp.static(wp.float32(tap(i - j)))
-                        dq[j] += y * wp.static(wp.float32(tap(i - j)))
-                        dp[j] += z * wp.static(wp.float32(tap(i - j)))
-        put(0, lane, dmx)
-        put(1, lane, dq)
-        put(2, lane, dp)
-        sync_block()
-        gmx = Group()
-        gq = Group()
-        gp = Group()
-        if lane < COLUMNS:
-            gmx = blur(0, lane)
-            gq = blur(1, lane)
-            gp = blur(2, lane)
-        sync_block()
-        if lane < COLUMNS:
-            put_group(0, lane, gmx)
-            put_group(1, lane, gq)
-            put_group(2, lane, gp)
-        sync_block()
-        column = at[1] + lane
-        if lane < COLUMNS and column < width:
-            factor = -scale * grad_loss[0]
-            for j in range(wp.static(ROWS)):
-                row = at[2] + j
-                if row < height:
-                    k = row * width + column
-                    cells = j * THREADS + lane
-                    change = cell(False, cells, 0.0) + cell(False, cells + wp.static(ROWS * THREADS), 0.0) * image[k]
-                    change += cell(False, cells + wp.static(2 * ROWS * THREADS), 0.0) * target[k]
-                    grad_image[k] = change * factor
 
-    return gradient
+@wp.kernel(**OPTIONS)
+def gradient(  # noqa: PLR0913  # a kernel entry point
+    first: wp.int32,
+    derivatives: wp.array2d(dtype=wp.float32),
+    image: wp.array(dtype=wp.float32),
+    target: wp.array(dtype=wp.float32),
+    height: wp.int32,
+    width: wp.int32,
+    scale: wp.float32,
+    grad_loss: wp.array(dtype=wp.float32),
+    # outputs
+    grad_image: wp.array(dtype=wp.float32),
+):
+    at = place(first + wp.tid(), width)
+    lane = at[0]
+    column = at[1] - 3 * REACH + lane
+    dmx = Sums()
+    dq = Sums()
+    dp = Sums()
+    if column >= 0 and column < width:
+        for i in range(wp.static(READ)):
+            row = at[2] + i - REACH
+            x = float(0.0)
+            y = float(0.0)
+            z = float(0.0)
+            if row >= 0 and row < height:
+                x = derivatives[0, row * width + column]
+                y = derivatives[1, row * width + column]
+                z = derivatives[2, row * width + column]
+            dmx = spread(i, x, dmx)
+            dq = spread(i, y, dq)
+            dp = spread(i, z, dp)
+    put(0, lane, dmx)
+    put(1, lane, dq)
+    put(2, lane, dp)
+    sync_block()
+    gmx = Sums()
+    gq = Sums()
+    gp = Sums()
+    if lane < COLUMNS:
+        gmx = blur(0, lane)
+        gq = blur(1, lane)
+        gp = blur(2, lane)
+    sync_block()
+    if lane < COLUMNS:
+        put_group(0, lane, gmx)
+        put_group(1, lane, gq)
+        put_group(2, lane, gp)
+    sync_block()
+    column = at[1] + lane
+    if lane < COLUMNS and column < width:
+        factor = -scale * grad_loss[0]
+        for j in range(wp.static(ROWS)):
+            row = at[2] + j
+            if row < height:
+                k = row * width + column
+                cells = j * THREADS + lane
+                change = cell(False, cells, 0.0) + cell(False, cells + wp.static(ROWS * THREADS), 0.0) * image[k]
+                change += cell(False, cells + wp.static(2 * ROWS * THREADS), 0.0) * target[k]
+                grad_image[k] = change * factor

@@ -3,7 +3,7 @@
 import torch
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.ssim import C1, C2, REACH, THREADS, WINDOW_SIZE, blocks_of, gradient_kernel, score_kernel, tap
+from nexwarp.kernels.ssim import C1, C2, REACH, THREADS, WINDOW_SIZE, blocks_of, gradient, score, tap
 from nexwarp.ops._interop import Context, first_derivative, launch, real_of
 
 
@@ -58,7 +58,7 @@ class _KernelDSSIM(torch.autograd.Function):
         threads = THREADS * blocks_of(height, width)
         losses = image.new_empty(threads)
         inputs = [image, target, height, width, ctx.rest]
-        launch(image, score_kernel(), threads, inputs, [losses, derivatives], block_dim=THREADS)
+        launch(image, score, threads, inputs, [losses, derivatives], block_dim=THREADS)
         return losses.sum()
 
     @staticmethod
@@ -68,5 +68,5 @@ class _KernelDSSIM(torch.autograd.Function):
         height, width = image.shape[0], 3 * image.shape[1]
         grad_image = torch.empty_like(image)
         inputs = [derivatives, image, target, height, width, ctx.rest, grad_loss]
-        launch(image, gradient_kernel(), THREADS * blocks_of(height, width), inputs, [grad_image], block_dim=THREADS)
+        launch(image, gradient, THREADS * blocks_of(height, width), inputs, [grad_image], block_dim=THREADS)
         return grad_image, None, None
