@@ -1,4 +1,4 @@
-"""What compares an image with a photo pixel by pixel: a thread is a pixel.
+"""What compares an image with a photo, and depths with those that are expected, pixel by pixel: a thread is a pixel.
 
 The loss terms are the L1 of the image, of the texture, and the weight that has no texture.
 
@@ -195,3 +195,79 @@ def expose_kernels(real: type) -> SimpleNamespace:
             grad_textured[p] = wp.cw_mul(grad_exposed_colors[p], e)
 
     return SimpleNamespace(forward=expose, backward=expose_backward)
+
+
+@wp.func
+def place_of(places: wp.array(dtype=wp.int64), i: int):
+    if places:
+        return int(places[i])
+    return i
+
+
+@functools.cache
+def depth_kernels(real: type) -> SimpleNamespace:
+    """Make the kernel that compares depths with those `expected` of points, 0 where unknown, and its derivative.
+
+    `places` are the points' pixels, in ascending order; where they are a null array, point i is in pixel i. With the
+    weights W and depths D of a pixel's hits, a point's error is factor * |sum W D / (sum W + eps) / expected - 1|.
+    """
+    ZERO, ONE, EPS = real(0.0), wp.constant(real(1.0)), wp.constant(real(WEIGHT_EPSILON))
+
+    @wp.func
+    def mean_depth(depths: wp.array2d(dtype=real), weights: wp.array2d(dtype=real), p: int):
+        mean = ZERO
+        for h in range(depths.shape[1]):
+            mean += weights[p, h] * depths[p, h]
+        return mean / (total(weights, p) + EPS)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def depth_errors(
+        first: wp.int32,
+        depths: wp.array2d(dtype=real),
+        weights: wp.array2d(dtype=real),
+        expected: wp.array(dtype=real),
+        places: wp.array(dtype=wp.int64),
+        factor: real,
+        # output: the error of each point, and whether it counts
+        terms: wp.array2d(dtype=real),
+    ):
+        i = first + wp.tid()
+        error, known = ZERO, ZERO
+        if expected[i] > ZERO:
+            p = place_of(places, i)
+            error = factor * wp.abs(mean_depth(depths, weights, p) / expected[i] - ONE)
+            known = ONE
+        terms[0, i] = error
+        terms[1, i] = known
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def depth_errors_backward(  # noqa: PLR0913  # a kernel entry point
+        first: wp.int32,
+        depths: wp.array2d(dtype=real),
+        weights: wp.array2d(dtype=real),
+        expected: wp.array(dtype=real),
+        places: wp.array(dtype=wp.int64),
+        factor: real,
+        sums: wp.array(dtype=real),  # of what the other kernel writes
+        grad_loss: wp.array(dtype=real),
+        # outputs
+        grad_depths: wp.array2d(dtype=real),
+        grad_weights: wp.array2d(dtype=real),
+    ):
+        p = first + wp.tid()
+        mean = mean_depth(depths, weights, p)
+        change = ZERO
+        start = p
+        if places:
+            start = wp.lower_bound(places, wp.int64(p))
+        for i in range(start, expected.shape[0]):
+            if place_of(places, i) != p:
+                break
+            if expected[i] > ZERO:
+                change += sign(mean / expected[i] - ONE) / expected[i]
+        change *= grad_loss[0] * factor / wp.max(sums[1], ONE) / (total(weights, p) + EPS)
+        for h in range(depths.shape[1]):
+            grad_depths[p, h] = change * weights[p, h]
+            grad_weights[p, h] = change * (depths[p, h] - mean)
+
+    return SimpleNamespace(forward=depth_errors, backward=depth_errors_backward)

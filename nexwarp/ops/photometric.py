@@ -1,13 +1,13 @@
-"""What compares an image with a photo pixel by pixel: several losses in one go, and the photo's exposure."""
+"""What compares pixel by pixel: several losses of an image and a photo in one go, its exposure, and depths."""
 
 import math
 
 import torch
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.photometric import expose_kernels, photometric_kernels
+from nexwarp.kernels.photometric import depth_kernels, expose_kernels, photometric_kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, real_of
+from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, needed, real_of
 
 Factors = tuple[float, float, float]
 
@@ -126,3 +126,57 @@ class _Expose(torch.autograd.Function):
         inputs = [image, exposure, photo, ctx.rest, *grads]
         launch(image, expose_kernels(real_of(image)).backward, photo.numel() // 3, inputs, results)
         return *results, None, None, None
+
+
+def depth_term(
+    depths: torch.Tensor,
+    weights: torch.Tensor,
+    expected: torch.Tensor,
+    places: torch.Tensor | None = None,
+    *,
+    factor: float = 1.0,
+) -> torch.Tensor:
+    """Return factor times the mean of |mean depth of a pixel's hits / expected depth - 1| over known expected depths.
+
+    No error has a larger gradient than another. Differentiable once, with respect to depths and weights; the same bits
+    in any order of threads.
+
+    Args:
+        depths: (H, W, K) z-depths of the textured hits, world units.
+        weights: (H, W, K), W.
+        expected: z-depths (H, W), or (M,) of points in the pixels `places`; 0 where unknown, which does not count.
+        places: (M,) int64, row * W + column, ascending.
+        factor: of the mean, which is 0 without any known depth.
+    """
+    shape: tuple[int | str, ...] = ("H", "W") if places is None else ("M",)
+    hits = ("H", "W", "K")
+    check_tensors({"depths": (depths, hits), "weights": (weights, hits), "expected": (expected, shape)})
+    return _DepthTerm.apply(*contiguous(depths, weights, expected, places), factor)
+
+
+class _DepthTerm(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Context,
+        depths: torch.Tensor,
+        weights: torch.Tensor,
+        expected: torch.Tensor,
+        places: torch.Tensor | None,
+        factor: float,
+    ) -> torch.Tensor:
+        terms = depths.new_empty(2, expected.numel())
+        inputs = [depths, weights, expected, places, factor]
+        launch(depths, depth_kernels(real_of(depths)).forward, expected.numel(), inputs, [terms])
+        sums = terms.sum(1)
+        ctx.save_for_backward(depths, weights, expected, places, sums)
+        ctx.rest = factor
+        return sums[0] / sums[1].clamp_min(1)
+
+    @staticmethod
+    @first_derivative
+    def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        *tensors, sums = ctx.saved_tensors
+        grads = [torch.empty_like(x) for x in tensors[:2]]
+        kernel, pixels = depth_kernels(real_of(sums)).backward, grads[0].shape[0] * grads[0].shape[1]
+        launch(sums, kernel, pixels, [*tensors, ctx.rest, sums, grad], grads)
+        return (*needed(grads, ctx.needs_input_grad[:2]), None, None, None)

@@ -13,7 +13,7 @@ import torch
 from nexwarp import ops
 from nexwarp.kernels.photometric import WEIGHT_EPSILON
 from nexwarp.model.render import Rendering
-from nexwarp.ops.photometric import photometric_terms
+from nexwarp.ops.photometric import depth_term, photometric_terms
 from nexwarp.ops.ssim import weighted_dssim
 from nexwarp.train.recipe import LossWeights
 from nexwarp.train.state import TrainingState
@@ -107,29 +107,6 @@ def _masked(
     return torch.where(seen, textured, perfect), torch.where(seen, weights, fixed)
 
 
-def depth_loss(
-    depths: torch.Tensor, weights: torch.Tensor, places: torch.Tensor, expected: torch.Tensor
-) -> torch.Tensor:
-    """`depth_map_loss` of points with z-depths `expected` (M,), in pixels `places` (M,) int64, row * W + column."""
-    # Not by two indices: on a CPU that adds its gradients, where there are many, by atomics in any order.
-    shares, reached = (x.flatten(0, 1).index_select(0, places) for x in (weights, depths))
-    return depth_map_loss(reached, shares, expected)
-
-
-def depth_map_loss(depths: torch.Tensor, weights: torch.Tensor, expected: torch.Tensor) -> torch.Tensor:
-    """Mean over pixels of |mean depth of their hits / expected depth - 1|: no error has a larger gradient than another.
-
-    Args:
-        depths: (..., K) z-depths of the textured hits, world units.
-        weights: (..., K), W.
-        expected: (...) z-depths, world units; 0 where unknown, which does not count. 0 without any.
-    """
-    means = (weights * depths).sum(-1) / (weights.sum(-1) + WEIGHT_EPSILON)
-    known = expected > 0
-    errors = (means / torch.where(known, expected, 1) - 1).abs() * known
-    return errors.sum() / known.sum().clamp_min(1)
-
-
 def normal_loss(out: Rendering, counts: torch.Tensor | None = None) -> torch.Tensor:
     """Mean over pixels of sum over hits of weight * (1 - n . N), with N the normal of the median depths' map.
 
@@ -210,9 +187,10 @@ def step_losses(
     if target.empty is not None and factors.empty > 0:
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:
-        losses["depth"] = factors.depth * depth_loss(out.depths, out.weights, target.places, target.expected)
+        points = target.expected, target.places
+        losses["depth"] = depth_term(out.depths, out.weights, *points, factor=factors.depth)
     if target.depth is not None:
-        losses["depth_maps"] = factors.depth_maps * depth_map_loss(out.depths, out.weights, target.depth)
+        losses["depth_maps"] = depth_term(out.depths, out.weights, target.depth, factor=factors.depth_maps)
     if target.normals > 0:
         losses["normals"] = target.normals * normal_loss(out, target.counts)
     if state.poses is not None and target.view is not None:

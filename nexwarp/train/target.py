@@ -50,7 +50,7 @@ class Target:
         exposure: (3,) or (H, W, 3), the photo's gains times the lens's falloff; None is the mean exposure.
         counts: (H, W) bool, where the photo counts; None is everywhere.
         empty: (H, W) bool, where there is nothing but the background; None is nowhere.
-        places: (M,) int64, row * W + column of the points whose depths are compared; None is no such loss.
+        places: (M,) int64, row * W + column of the points whose depths are compared, ascending; None is no such loss.
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
         depth: (H, W) z-depths of the photo's depth map, world units, 0 where there is none; None is no such loss.
         depth_jitter: (H, W, K), the `jitter` of `nexwarp.model.render.draw`; None is none.
@@ -153,11 +153,12 @@ class TargetSource:
             visible = visible_points(*seen, camera.width, camera.height, mask)
             none = torch.zeros(0, dtype=torch.int64, device=device), torch.zeros(0, device=device)
             places, expected = none if visible is None else visible
+            places, order = places.sort(stable=True)
             # On CUDA, as many for every view, so that one graph serves all of them. Steps that are not captured pad
             # too: sums of other lengths are rounded differently.
-            fill = self._most_points - len(places) if device.type == "cuda" else 0
-            pad = torch.nn.functional.pad
-            self.points[index] = pad(places, (0, fill)), pad(expected, (0, fill))
+            fill = (0, self._most_points - len(places) if device.type == "cuda" else 0)
+            beyond, pad = camera.width * camera.height, torch.nn.functional.pad
+            self.points[index] = pad(places, fill, value=beyond), pad(expected[order], fill)
         places, expected = self.points[index]
         return dataclasses.replace(target, places=places, expected=expected)
 

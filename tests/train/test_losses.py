@@ -6,6 +6,7 @@ import torch
 from torch.autograd import gradcheck
 
 from nexwarp.cameras.camera import visible_points
+from nexwarp.ops.photometric import depth_term
 from nexwarp.ops.ssim import weighted_dssim as dssim
 from nexwarp.train import losses
 from nexwarp.train.recipe import LossWeights
@@ -137,27 +138,29 @@ def test_visible_points_by_hand() -> None:
     assert visible_points(pixels, -depths.abs(), 4, 3) is None
 
 
-def test_depth_loss_by_hand() -> None:
+def test_depth_loss_by_hand(device: torch.device) -> None:
     """Two slots of weights 0.3 and 0.1 at depths 2 and 4: 2.5 in the mean, against 2; and a pixel without hits."""
     depths, weights = torch.zeros(3, 4, 2), torch.zeros(3, 4, 2)
     depths[1, 2], weights[1, 2] = torch.tensor([2.0, 4.0]), torch.tensor([0.3, 0.1])
-    places, expected = torch.tensor([6, 6, 0]), torch.tensor([2.0, 2.5, 3.0])
-    assert losses.depth_loss(depths, weights, places, expected).item() == pytest.approx((0.25 + 0 + 1) / 3, abs=1e-5)
+    places, expected = torch.tensor([0, 6, 6]), torch.tensor([3.0, 2.0, 2.5])
+    loss = depth_term(*(x.to(device) for x in (depths, weights, expected, places)))
+    assert loss.item() == pytest.approx((0.25 + 0 + 1) / 3, abs=1e-5)
 
 
 def test_what_fills_up_points_does_not_count() -> None:
     depths = (2 + torch.rand(3, 4, 2)).requires_grad_()
     weights = (0.1 + 0.4 * torch.rand(3, 4, 2)).requires_grad_()
-    places, expected = torch.tensor([3, 11, 5]), torch.tensor([1.5, 4.0, 3.9])
+    places, expected = torch.tensor([3, 5, 11]), torch.tensor([1.5, 3.9, 4.0])
     found = []
     for fill in (0, 5):
-        padded = torch.cat([places, places.new_zeros(fill)]), torch.cat([expected, expected.new_zeros(fill)])
-        loss = losses.depth_loss(depths, weights, *padded)
+        padded = torch.cat([expected, expected.new_zeros(fill)]), torch.cat([places, places.new_full((fill,), 12)])
+        loss = depth_term(depths, weights, *padded)
         found.append([loss.detach(), *torch.autograd.grad(loss, [depths, weights])])
     for bare, filled in zip(*found, strict=True):
         assert torch.equal(bare, filled)
-    none = losses.depth_loss(depths, weights, places, torch.zeros(3))
-    assert none.item() == 0 and not any(x.any() for x in torch.autograd.grad(none, [depths, weights]))
+    for count in (3, 0):
+        none = depth_term(depths, weights, torch.zeros(count), places[:count])
+        assert none.item() == 0 and not any(x.any() for x in torch.autograd.grad(none, [depths, weights]))
 
 
 def test_the_loss_of_a_depth_map_is_that_of_points_in_all_pixels() -> None:
@@ -165,21 +168,22 @@ def test_the_loss_of_a_depth_map_is_that_of_points_in_all_pixels() -> None:
     depths = (2 + torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
     weights = (0.1 + 0.4 * torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
     expected = 1.5 + 3 * torch.rand(3, 4, dtype=torch.float64)
-    one = losses.depth_map_loss(torch.tensor([2.0, 4.0]), torch.tensor([0.3, 0.1]), torch.tensor(2.0))
+    one = depth_term(torch.tensor([[[2.0, 4.0]]]), torch.tensor([[[0.3, 0.1]]]), torch.tensor([[2.0]]))
     assert one.item() == pytest.approx(0.25, abs=1e-5)
     expected[1, :2] = 0
     known = expected.flatten().nonzero()[:, 0]
-    loss = losses.depth_map_loss(depths, weights, expected)
-    points = losses.depth_loss(depths, weights, known, expected.flatten()[known])
+    loss = depth_term(depths, weights, expected)
+    points = depth_term(depths, weights, expected.flatten()[known], known)
     assert_close(loss, points, kind="value", name="loss")
-    assert gradcheck(lambda d, w: losses.depth_map_loss(d, w, expected), [depths, weights])
+    assert gradcheck(lambda d, w: depth_term(d, w, expected), [depths, weights])
     for gradient in torch.autograd.grad(loss, [depths, weights]):
         assert not gradient[1, :2].any() and gradient[expected > 0].any()
-    assert losses.depth_map_loss(depths, weights, torch.zeros(3, 4)).item() == 0
+    assert depth_term(depths, weights, torch.zeros(3, 4, dtype=torch.float64)).item() == 0
 
 
-def test_depth_loss_against_finite_differences() -> None:
+def test_depth_loss_against_finite_differences(device: torch.device) -> None:
     depths = (2 + torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
     weights = (0.1 + 0.4 * torch.rand(3, 4, 2, dtype=torch.float64)).requires_grad_()
-    places, expected = torch.tensor([0, 11, 0, 5]), torch.tensor([1.5, 4.0, 3.9, 2.0], dtype=torch.float64)
-    assert gradcheck(lambda d, w: losses.depth_loss(d, w, places, expected), [depths, weights])
+    places, expected = torch.tensor([0, 0, 5, 11]), torch.tensor([1.5, 3.9, 2.0, 4.0], dtype=torch.float64)
+    points = expected.to(device), places.to(device)
+    assert gradcheck(lambda d, w: depth_term(d.to(device), w.to(device), *points), [depths, weights])
