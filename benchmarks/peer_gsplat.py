@@ -4,8 +4,8 @@ gsplat is optional: `pip install gsplat==1.5.3`, with a CUDA compiler to build i
 the density control; this module is the loop around them, with the settings of its examples (`simple_trainer.py mcmc`
 and `default`, `simple_trainer_2dgs.py`): scene centred on the cameras and scaled to their median distance, points as
 initial means, L1 + 0.2 D-SSIM. With MCMC: opacity 0.5, scale a tenth of the distance to 3 neighbours, opacity and
-scale regularised by 0.01. D-SSIM is ours, with "same" padding in place of "valid". `PeerSettings` adds what our default
-has and the examples lack.
+scale regularised by 0.01. D-SSIM is ours, of clamped images, with "same" padding in place of "valid". `PeerSettings`
+adds what our default has and the examples lack.
 """
 
 import math

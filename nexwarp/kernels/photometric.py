@@ -2,6 +2,7 @@
 
 The loss terms are the L1 of the image, of the texture, and the weight that has no texture.
 
+The image is clamped to [0, 1] (and has no gradient beyond), as the authors' code does.
 With S = sum_k W, a pixel's share is |image - target|, |textured / (S + eps) - target| (both summed over the channels)
 and 1 - S, each times a scale, which holds the term's factor and the number of values. A term whose
 output, or whose incoming gradient, is a null array is left out. At a difference of 0 an L1 has the gradient 0. A
@@ -20,6 +21,17 @@ WEIGHT_EPSILON = 1e-6  # keeps the un-premultiplied texture finite where nothing
 
 
 @wp.func
+def clamped(x: Any):
+    """X in [0, 1]; NaN stays."""
+    return wp.where(x < type(x)(0.0), type(x)(0.0), wp.where(x > type(x)(1.0), type(x)(1.0), x))
+
+
+@wp.func
+def clamped_backward(x: Any, grad: Any):
+    return wp.where(x >= type(x)(0.0) and x <= type(x)(1.0), grad, type(x)(0.0))
+
+
+@wp.func
 def sign(x: Any):
     """1, 0 or -1; 0 for NaN."""
     zero = type(x)(0.0)
@@ -29,6 +41,16 @@ def sign(x: Any):
 @wp.func
 def signs(x: Any):
     return type(x)(sign(x[0]), sign(x[1]), sign(x[2]))
+
+
+@wp.func
+def clamped_color(x: Any):
+    return type(x)(clamped(x[0]), clamped(x[1]), clamped(x[2]))
+
+
+@wp.func
+def clamped_color_backward(x: Any, grad: Any):
+    return type(x)(clamped_backward(x[0], grad[0]), clamped_backward(x[1], grad[1]), clamped_backward(x[2], grad[2]))
 
 
 @wp.func
@@ -83,7 +105,7 @@ def photometric_kernels(real: type) -> SimpleNamespace:
         p = first + wp.tid()
         weight = total(weights, p)
         if l1:
-            l1[p] = distance(difference(image[p], target[p], saturation)) * scales[0]
+            l1[p] = distance(difference(clamped_color(image[p]), target[p], saturation)) * scales[0]
         if texture:
             texture[p] = distance(difference(textured[p] / (weight + EPS), target[p], saturation)) * scales[1]
         if alpha:
@@ -108,15 +130,17 @@ def photometric_kernels(real: type) -> SimpleNamespace:
     ):
         p = first + wp.tid()
         if grad_image:
-            grad_image[p] = signs(difference(image[p], target[p], saturation)) * (grad_l1[0] * scales[0])
+            color = image[p]
+            grad = signs(difference(clamped_color(color), target[p], saturation)) * (grad_l1[0] * scales[0])
+            grad_image[p] = clamped_color_backward(color, grad)
         change = real(0.0)
         if grad_texture:
             divisor = total(weights, p) + EPS
-            color = textured[p] / divisor
-            grad = signs(difference(color, target[p], saturation)) * (grad_texture[0] * scales[1]) / divisor
-            change -= wp.dot(grad, color)
+            seen = textured[p] / divisor
+            pull = signs(difference(seen, target[p], saturation)) * (grad_texture[0] * scales[1]) / divisor
+            change -= wp.dot(pull, seen)
             if grad_textured:
-                grad_textured[p] = grad
+                grad_textured[p] = pull
         if grad_alpha:
             change -= grad_alpha[0] * scales[2]
         if grad_weights:

@@ -1,6 +1,7 @@
 """D-SSIM and its derivative on GPUs, in float32: one kernel each way, without maps of blurs in memory; no atomics.
 
-With x, y the image and the target, mx, my their blurs, q = blur((x^2 + y^2) / 2) and p = blur(x y), the map of SSIM is
+With x the image, clamped to [0, 1], y the target, mx, my their blurs, q = blur((x^2 + y^2) / 2) and p = blur(x y), the
+map of SSIM is
     s = a b / (c d),   a = mx my + C1 / 2,   b = p - mx my + C2 / 2,
     c = (mx^2 + my^2) / 2 + C1 / 2,   d = q - (mx^2 + my^2) / 2 + C2 / 2,
 so that four blurs suffice, and its derivatives are
@@ -16,6 +17,8 @@ along a row; and what comes of that goes through shared memory again, so that ne
 import math
 
 import warp as wp
+
+from nexwarp.kernels.photometric import clamped, clamped_backward
 
 WINDOW_SIZE = 11
 WINDOW_SIGMA = 1.5
@@ -211,7 +214,7 @@ def score(
             x = float(0.0)
             y = float(0.0)
             if row >= 0 and row < height:
-                x = image[row * width + column]
+                x = clamped(image[row * width + column])
                 y = target[row * width + column]
             mx = spread(i, x, mx)
             my = spread(i, y, my)
@@ -308,6 +311,7 @@ def gradient(  # noqa: PLR0913  # a kernel entry point
             if row < height:
                 k = row * width + column
                 cells = j * THREADS + lane
-                change = cell(False, cells, 0.0) + cell(False, cells + wp.static(ROWS * THREADS), 0.0) * image[k]
+                x = image[k]
+                change = cell(False, cells, 0.0) + cell(False, cells + wp.static(ROWS * THREADS), 0.0) * clamped(x)
                 change += cell(False, cells + wp.static(2 * ROWS * THREADS), 0.0) * target[k]
-                grad_image[k] = change * factor
+                grad_image[k] = clamped_backward(x, change * factor)

@@ -26,10 +26,10 @@ def photometric_terms(
     """Return the L1, texture and alpha terms of `nexwarp.train.losses`, each times its factor.
 
     They are the means of |image - target|, of |textured / (sum_k W + 1e-6) - target| and of 1 - sum_k W, with image,
-    textured and target (H, W, 3) and weights W (H, W, K), float32 or float64. Differentiable once, with respect to
-    image, textured and weights; ValueError where `target` requires a gradient. What no wanted term reads may be None;
-    a factor of 0 gives None, at no cost. A channel of `target` with at least the value `saturation` equals any brighter
-    one.
+    textured and target (H, W, 3) and weights W (H, W, K), float32 or float64; the image is clamped to [0, 1].
+    Differentiable once, with respect to image, textured and weights; ValueError where `target` requires a gradient.
+    What no wanted term reads may be None; a factor of 0 gives None, at no cost. A channel of `target` with at least
+    the value `saturation` equals any brighter one.
     """
     wanted: dict[str, tuple[torch.Tensor | None, tuple[int | str, ...], float]] = {
         "image": (image, ("H", "W", 3), l1),

@@ -8,9 +8,9 @@ from nexwarp.ops._interop import Context, first_derivative, launch, real_of
 
 
 def weighted_dssim(image: torch.Tensor, target: torch.Tensor, factor: float = 1.0) -> torch.Tensor:
-    """Return factor * (1 - SSIM) of images (H, W, 3), float32 or float64; differentiable once, in `image` only.
+    """Return factor * (1 - SSIM) of images (H, W, 3), float32 or float64, the first one clamped to [0, 1].
 
-    ValueError where `target` requires a gradient, which it would not get.
+    Differentiable once, in `image` only. ValueError where `target` requires a gradient, which it would not get.
     """
     check_tensors({"image": (image, ("H", "W", 3)), "target": (target, ("H", "W", 3))})
     real_of(image)
@@ -18,7 +18,7 @@ def weighted_dssim(image: torch.Tensor, target: torch.Tensor, factor: float = 1.
         raise ValueError("target: expected a tensor that needs no gradient, got requires_grad=True")
     if image.is_cuda and image.dtype == torch.float32:
         return _KernelDSSIM.apply(image.contiguous(), target.contiguous(), factor)
-    return factor * (1.0 - ssim_map(image, target).mean())
+    return factor * (1.0 - ssim_map(image.clamp(0, 1), target).mean())
 
 
 def ssim_map(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:

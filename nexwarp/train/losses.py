@@ -1,6 +1,6 @@
 """The losses of a training step: those of paper Sec. 4.3, ours, and those that the caller of a training adds.
 
-Images are (H, W, 3) with values in [0, 1] (others are allowed). `weights` (H, W, K) holds the blending
+Images are (H, W, 3), photos with values in [0, 1]; renderings are clamped. `weights` (H, W, K) holds the blending
 weights W of the K textured hits of each pixel, empty slots 0, and `textured` (H, W, 3) is sum_k W_k T_k.
 Terms of images are differentiable once; a `target` gets no gradient, and one that requires it is refused.
 """
@@ -57,7 +57,7 @@ def photo_losses(
     A term whose factor is 0 is neither computed nor returned; with K = 0 there is no texture and no alpha term.
 
     Args:
-        image: (H, W, 3), the rendering with its background.
+        image: (H, W, 3), the rendering with its background; clamped to [0, 1], as by the authors' code.
         textured: (H, W, 3), sum_k W T.
         weights: (H, W, K), W.
         target: (H, W, 3), the photograph.
@@ -173,7 +173,7 @@ def step_losses(
     """
     texture, factors = state.texture, state.config.losses
     losses = photo_losses(
-        out.image.clamp(0, 1),  # as the authors' code does
+        out.image,
         out.textured,
         out.weights,
         target.photo,

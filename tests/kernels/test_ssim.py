@@ -27,7 +27,7 @@ def with_gradient(image: torch.Tensor, target: torch.Tensor, factor: float = 1.0
 @pytest.mark.parametrize("size", SIZES)
 def test_dssim_is_the_references(device: torch.device, size: tuple[int, int], dtype: torch.dtype) -> None:
     image, target = images(*size)
-    expected = 0.3 * reference.dssim(image, target)
+    expected = 0.3 * reference.dssim(image.clamp(0, 1), target)
     (expected_gradient,) = torch.autograd.grad(expected, image)
     loss, gradient = with_gradient(image.to(device, dtype), target.to(device, dtype), 0.3)
     assert loss.dtype == gradient.dtype == dtype
@@ -55,14 +55,13 @@ def test_result_repeats_on_cuda() -> None:
         assert torch.equal(gradient, results[0][1])
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_what_is_not_finite_shows_and_stays_near(device: torch.device, bad: float) -> None:
-    """A pixel is in the windows of its 11 x 11 neighbours, and these are in those of 21 x 21."""
+def test_what_is_not_a_number_shows_and_stays_near(device: torch.device) -> None:
+    """A pixel is in the windows of its 11 x 11 neighbours, these in those of 21 x 21; clamped ones have no gradient."""
     image, target = (x.to(device) for x in images(50, 40))
     with torch.no_grad():
-        image[22, 15, 1] = bad
+        image[22, 15, 1] = float("nan")
     loss, gradient = with_gradient(image, target)
     assert loss.isnan()
-    wrong = ~gradient.isfinite()
-    assert wrong[12:33, 5:26, 1].all()
-    assert int(wrong.sum()) == 21 * 21
+    expected = torch.zeros_like(gradient, dtype=torch.bool)
+    expected[12:33, 5:26, 1] = ((image >= 0) & (image <= 1))[12:33, 5:26, 1]
+    assert torch.equal(~gradient.isfinite(), expected)
