@@ -7,6 +7,7 @@ mean gain, and the lens near no falloff.
 """
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera, in_image
 from nexwarp.data import Scene, View
+from nexwarp.machine import torch_threads
 from nexwarp.model.exposures import DECIMALS, Exposures
 from nexwarp.train.recipe import Config
 
@@ -55,7 +57,8 @@ def calibrate_exposures(scene: Scene, config: Config) -> ExposureCalibration | N
         return None
     cameras = [view.camera for view in scene.train]
     seen = observations(scene.train)
-    fit = choose_fit(seen, cameras)
+    with torch_threads(1):  # threads that share small matrices wait for each other
+        fit = choose_fit(seen, cameras)
     if fit is None:
         return None
     log_gains = torch.from_numpy(fit.gains)
@@ -64,18 +67,19 @@ def calibrate_exposures(scene: Scene, config: Config) -> ExposureCalibration | N
 
 
 class Observations(NamedTuple):
-    """M observations of P points in photos."""
+    """M observations of P points in photos, point by point."""
 
     view: np.ndarray  # (M,) index of the photo
-    point: np.ndarray  # (M,) index of the point
-    color: np.ndarray  # (M, 3) log colour
+    point: np.ndarray  # (M,) index of the point, which never falls
+    color: np.ndarray  # (3, M) log colour
     squares: np.ndarray  # (M,) squared tangent of the angle to the optical axis
     places: np.ndarray  # (P, 3) positions of the points, float32
 
     def of_points(self, chosen: np.ndarray) -> "Observations":
         """Return the observations of those points for which `chosen` (P,) is True."""
         kept = chosen[self.point]
-        return Observations(self.view[kept], self.point[kept], self.color[kept], self.squares[kept], self.places)
+        point = (np.cumsum(chosen) - 1)[self.point[kept]]
+        return Observations(self.view[kept], point, self.color[:, kept], self.squares[kept], self.places[chosen])
 
 
 class Fit(NamedTuple):
@@ -86,21 +90,42 @@ class Fit(NamedTuple):
     largest: float  # largest squared tangent of an observed point
 
     def powers(self, seen: Observations) -> np.ndarray:
-        """Return t and t^2 (M, 2) of observations."""
+        """Return t and t^2 (2, M) of observations."""
         t = seen.squares / self.largest
-        return np.stack([t, t**2], axis=1)
+        return np.stack([t, t**2])
 
     def unexposed(self, seen: Observations) -> np.ndarray:
-        """Return the log colours (M, 3) of observations without gains and falloff."""
-        return seen.color - self.gains[seen.view] - (self.powers(seen) @ self.lens)[:, None]
+        """Return the log colours (3, M) of observations without gains and falloff."""
+        return seen.color - self.gains.T.take(seen.view, axis=1) - self.lens @ self.powers(seen)
+
+
+class Weights:
+    """Weights (C, M) of observations of points, in C channels."""
+
+    def __init__(self, point: np.ndarray, values: np.ndarray) -> None:
+        self.point, self.values = point, values
+        self.totals = np.stack([np.bincount(point, w) for w in values]).clip(LEAST_WEIGHT)
+
+    def apart(self, values: np.ndarray) -> np.ndarray:
+        """Return how values (C, M) or (M,) differ from the mean over their points."""
+        sums = np.stack([np.bincount(self.point, w) for w in self.values * values])
+        return values - (sums / self.totals).take(self.point, axis=1)
 
 
 def observations(views: Sequence[View]) -> Observations:
     """Return all usable observations of points in photos; a point that photos share has the same bits in each."""
     parts = [_observed(index, view) for index, view in enumerate(views)]
     view, places, color, squares = (np.concatenate(values) for values in zip(*parts, strict=True))
-    distinct, point = np.unique(places, axis=0, return_inverse=True)
-    return Observations(view, point.reshape(-1), color, squares, distinct)
+    order, point = _numbered(places)
+    first = order[np.flatnonzero(np.diff(point, prepend=-1))]
+    return Observations(view[order], point, color[order].T.copy(), squares[order], places[first])
+
+
+def _numbered(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the order (M,) of positions (M, 3) by x, y and z, and in that order the numbers of distinct ones."""
+    order = np.lexsort(places.T[::-1])
+    new = (places[order[1:]] != places[order[:-1]]).any(axis=1)
+    return order, np.concatenate([np.zeros(min(len(places), 1), np.int64), np.cumsum(new)])
 
 
 def _observed(index: int, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -130,7 +155,9 @@ def choose_fit(seen: Observations, cameras: Sequence[Camera]) -> Fit | None:
     halves = _halves(seen.of_points(np.arange(len(seen.places)) % stride == 0))
     if not halves:  # no points, or one that cannot be cut in two
         return None
-    none, gains, both = np.mean([_held_out_errors(*pair, cameras) for pair in halves], axis=0).tolist()
+    with ThreadPoolExecutor(len(halves)) as pool:
+        errors = list(pool.map(lambda pair: _held_out_errors(pair[0], pair[1], cameras), halves))
+    none, gains, both = np.mean(errors, axis=0).tolist()
     vignetting = both < (1 - MARGIN) * gains
     if (both if vignetting else gains) >= (1 - MARGIN) * none:
         return None
@@ -141,7 +168,7 @@ def _halves(seen: Observations) -> list[tuple[Observations, Observations]]:
     """Cut the points at the median along each principal axis of their places; return both orders of both halves."""
     if not len(seen.view):
         return []
-    places = seen.places[np.unique(seen.point)].astype(np.float64)
+    places = seen.places.astype(np.float64)
     centre = np.median(places, axis=0)
     distances = np.linalg.norm(places - centre, axis=1)
     near = places[distances <= np.quantile(distances, 0.9)]  # without far points, which would dominate the axes
@@ -165,10 +192,11 @@ def _held_out_errors(fitted: Observations, held_out: Observations, cameras: Sequ
     none = Fit(np.zeros_like(gains.gains), np.zeros(2), gains.largest)
     errors = []
     for fit in (none, gains, both):
-        weights = np.ones(held_out.color.shape)
+        left, weights = fit.unexposed(held_out), np.ones(held_out.color.shape)
         for _ in range(ROUNDS):
-            weights, left = _robust(held_out, fit, weights)
-        errors.append(float(np.log1p((left / NOISE) ** 2).mean()))
+            rest = Weights(held_out.point, weights).apart(left)
+            weights = _robust(rest)
+        errors.append(float(np.log1p((rest / NOISE) ** 2).mean()))
     return errors
 
 
@@ -176,14 +204,14 @@ def fit_exposures(seen: Observations, cameras: Sequence[Camera], *, vignetting: 
     """Fit gains, and with `vignetting` the falloff of the lens, to one observation or more."""
     largest = max(min(FURTHER * float(seen.squares.max()), max(map(_corner, cameras))), 10.0**-DECIMALS)
     fit = Fit(np.zeros((len(cameras), 3)), np.zeros(2), round(largest, DECIMALS))
-    powers, weights = fit.powers(seen), np.ones(seen.color.shape)
+    powers, values = fit.powers(seen), np.ones(seen.color.shape)
+    solver = GainSolver(seen, len(cameras))
     for _ in range(ROUNDS):
-        observed = seen.color - (powers @ fit.lens)[:, None]
-        for channel in range(3):
-            fit.gains[:, channel] = solve_gains(seen, observed[:, channel], weights[:, channel], len(cameras))
+        weights = Weights(seen.point, values)
+        fit = fit._replace(gains=solver.gains(seen.color - fit.lens @ powers, weights).T)
         if vignetting:
-            fit = fit._replace(lens=_solve_lens(seen.point, powers, seen.color - fit.gains[seen.view], weights))
-        weights, _ = _robust(seen, fit, weights)
+            fit = fit._replace(lens=_solve_lens(powers, seen.color - fit.gains.T.take(seen.view, axis=1), weights))
+        values = _robust(weights.apart(fit.unexposed(seen)))
     return Fit(fit.gains.round(DECIMALS), fit.lens.round(DECIMALS), fit.largest)
 
 
@@ -193,59 +221,66 @@ def _corner(camera: Camera) -> float:
     return x**2 + y**2
 
 
-def solve_gains(seen: Observations, observed: np.ndarray, weights: np.ndarray, photos: int) -> np.ndarray:
-    """Return the log gains (V,), mean 0, of one channel of V photos by least squares of log colours (M,)."""
-    from scipy.linalg import solve
-    from scipy.sparse import csc_array, csr_array, diags_array
-    from scipy.sparse.linalg import spsolve
+class GainSolver:
+    """Solves for the log gains of V photos by least squares of log colours."""
 
-    # The points' own colours, eliminated, leave a Laplacian of the photos.
-    view, point = seen.view, seen.point
-    totals = np.bincount(point, weights).clip(LEAST_WEIGHT)
-    shares = csr_array((weights / np.sqrt(totals)[point], (view, point)), shape=(photos, len(totals)))
-    shared, diagonal = shares @ shares.T, np.bincount(view, weights, photos) + PRIOR
-    means = np.bincount(point, weights * observed) / totals
-    right = np.bincount(view, weights * (observed - means[point]), photos)
-    if photos <= MOST_DENSE:
-        gains = solve(np.diag(diagonal) - shared.toarray(), right, assume_a="pos")
-    else:
-        gains = spsolve(csc_array(diags_array(diagonal) - shared), right)
-    return gains - gains.mean()
+    def __init__(self, seen: Observations, photos: int) -> None:
+        self.view, self.point, self.photos = seen.view, seen.point, photos
+        self.order = np.argsort(seen.view, kind="stable")
+        self.first_of_point, self.first_of_photo = (
+            np.concatenate([[0], np.cumsum(np.bincount(index, minlength=count))])
+            for index, count in ((seen.point, len(seen.places)), (seen.view, photos))
+        )
 
+    def gains(self, observed: np.ndarray, weights: Weights) -> np.ndarray:
+        """Return the log gains (C, V), mean 0 in each channel, for log colours (C, M)."""
+        # The points' own colours, eliminated, leave a Laplacian of the photos.
+        right = weights.values * weights.apart(observed)
+        with ThreadPoolExecutor(len(right)) as pool:
+            gains = np.stack(list(pool.map(self._channel, weights.values, weights.totals, right)))
+        return gains - gains.mean(axis=1, keepdims=True)
 
-def _solve_lens(point: np.ndarray, powers: np.ndarray, observed: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Factors (2,) of the lens's powers (M, 2) in log colours (M, 3) without gains, by weighted least squares."""
-    normal, right = EVEN_PRIOR * np.eye(2), np.zeros(2)
-    for channel in range(3):
-        w = weights[:, channel : channel + 1].repeat(2, axis=1)
-        apart = powers - _means(point, powers, w)
-        normal += apart.T @ (w * apart)
-        right += apart.T @ (w[:, 0] * observed[:, channel])
-    return np.linalg.solve(normal, right)
+    def _channel(self, weights: np.ndarray, totals: np.ndarray, right: np.ndarray) -> np.ndarray:
+        from scipy.sparse import csc_array, csr_array, diags_array
+        from scipy.sparse.linalg import spsolve
 
-
-def _robust(seen: Observations, fit: Fit, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights (M, 3) of the next round, and what is left of the colours (M, 3) beside the points' own."""
-    left = fit.unexposed(seen)
-    left -= _means(seen.point, left, weights)
-    return 1 / (1 + (left / NOISE) ** 2), left
+        shares = weights / np.sqrt(totals).take(self.point)
+        by_point = csr_array((shares, self.view, self.first_of_point), (len(self.first_of_point) - 1, self.photos))
+        by_photo = csr_array((shares[self.order], self.point[self.order], self.first_of_photo), by_point.shape[::-1])
+        shared = by_photo @ by_point
+        diagonal = np.bincount(self.view, weights, self.photos) + PRIOR
+        right = np.bincount(self.view, right, self.photos)
+        if self.photos > MOST_DENSE:
+            return spsolve(csc_array(diags_array(diagonal) - shared), right)
+        factor = torch.linalg.cholesky(torch.from_numpy(np.diag(diagonal) - shared.toarray()))
+        return torch.cholesky_solve(torch.from_numpy(right)[:, None], factor)[:, 0].numpy()
 
 
-def _means(point: np.ndarray, values: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """For each of values (M, C) the weighted mean over those of its point."""
-    totals = [np.bincount(point, w).clip(LEAST_WEIGHT) for w in weights.T]
-    sums = [np.bincount(point, w * x) for x, w in zip(values.T, weights.T, strict=True)]
-    return np.stack([s / total for s, total in zip(sums, totals, strict=True)], axis=1)[point]
+def _solve_lens(powers: np.ndarray, observed: np.ndarray, weights: Weights) -> np.ndarray:
+    """Factors (2,) of the lens's powers (2, M) in log colours (3, M) without gains, by weighted least squares."""
+    apart = np.stack([weights.apart(power) for power in powers])  # (2, 3, M)
+    weighted = (apart * weights.values).reshape(2, -1)
+    normal = EVEN_PRIOR * np.eye(2) + weighted @ apart.reshape(2, -1).T
+    return np.linalg.solve(normal, weighted @ observed.reshape(-1))
+
+
+def _robust(left: np.ndarray) -> np.ndarray:
+    """Return weights of the next round, for what is left of colours beside the points' own."""
+    return 1 / (1 + (left / NOISE) ** 2)
 
 
 def _point_colors(scene: Scene, seen: Observations, fit: Fit) -> torch.Tensor:
     """Return colours (P, 3) of the scene's points at the mean exposure; a point that no photo shows keeps its own."""
-    weights, _ = _robust(seen, fit, np.ones(seen.color.shape))
-    _, left = _robust(seen, fit, weights)
+    colors = fit.unexposed(seen)
+    weights = _robust(Weights(seen.point, np.ones(colors.shape)).apart(colors))
     own = np.zeros(seen.places.shape)
-    own[seen.point] = fit.unexposed(seen) - left
-    row_of = {place.tobytes(): row for row, place in enumerate(seen.places)}
-    rows = np.array([row_of.get(place.tobytes(), -1) for place in scene.points.numpy()], dtype=np.int64)
+    own[seen.point] = (colors - Weights(seen.point, weights).apart(colors)).T
+    order, number = _numbered(np.concatenate([seen.places, scene.points.numpy()]))
+    numbers = np.empty_like(number)
+    numbers[order] = number
+    rows = np.full(len(number), -1)
+    rows[numbers[: len(own)]] = np.arange(len(own))
+    rows = rows[numbers[len(own) :]]
     shown = torch.from_numpy(rows >= 0)
     return torch.where(shown[:, None], torch.from_numpy(np.exp(own[rows])).float(), scene.colors.float() / 255).clamp(
         0, 1

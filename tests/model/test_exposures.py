@@ -151,8 +151,9 @@ def test_a_capture_of_one_exposure_is_left_alone(tmp_path):
     cameras, photos, points = photographs(torch.zeros(8, 3))
     even = observations(views(cameras, photos, points))
     assert choose_fit(even, cameras) is None
+    assert (np.diff(even.point) >= 0).all() and (even.places == np.unique(even.places, axis=0)).all()
     side = np.where(even.places[even.point, 1] < 0.1, 1.0, -1.0)
-    shaded = even._replace(color=even.color + 0.1 * (side * np.linspace(-1, 1, 8)[even.view])[:, None])
+    shaded = even._replace(color=even.color + 0.1 * side * np.linspace(-1, 1, 8)[even.view])
     assert abs(fit_exposures(shaded, cameras, vignetting=False).gains).max() > 0.02
     assert choose_fit(shaded, cameras) is None
 
@@ -182,7 +183,7 @@ def test_gains_are_the_least_squares_of_photos_and_points_together(monkeypatch, 
     monkeypatch.setattr(exposure_calibration, "MOST_DENSE", most_dense)
     random = np.random.default_rng(4)
     photos, points, count = 7, 30, 150
-    view, point = random.integers(0, photos - 1, count), random.integers(0, points, count)
+    view, point = random.integers(0, photos - 1, count), np.sort(random.integers(0, points, count))
     observed, weights = random.normal(size=count), random.uniform(0.1, 1.0, count)
     design = np.zeros((count, photos + points))
     design[np.arange(count), view] = design[np.arange(count), photos + point] = 1.0
@@ -190,8 +191,9 @@ def test_gains_are_the_least_squares_of_photos_and_points_together(monkeypatch, 
     prior = np.sqrt(exposure_calibration.PRIOR) * np.eye(photos, photos + points)
     together = np.concatenate([root[:, None] * design, prior]), np.concatenate([root * observed, np.zeros(photos)])
     expected = np.linalg.lstsq(*together, rcond=None)[0][:photos]
-    seen = Observations(view, point, observed[:, None], np.zeros(count), np.zeros((points, 3)))
-    gains = exposure_calibration.solve_gains(seen, observed, weights, photos)
+    seen = Observations(view, point, observed[None], np.zeros(count), np.zeros((points, 3)))
+    solver = exposure_calibration.GainSolver(seen, photos)
+    gains = solver.gains(observed[None], exposure_calibration.Weights(point, weights[None]))[0]
     np.testing.assert_allclose(gains, expected - expected.mean(), rtol=0, atol=1e-10)
 
 
