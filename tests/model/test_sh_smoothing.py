@@ -13,7 +13,6 @@ from nexwarp.train.finish import seen_directions, smooth_sh
 from nexwarp.train.recipe import MIN_STRENGTH, Config, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.reference.sh import basis as sh_basis
-from tests.scene_writers import write_demo
 from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
 
@@ -120,18 +119,12 @@ def test_unseen_surfels_get_one_colour_and_none_are_no_trouble(device: torch.dev
         assert torch.equal(a, b)
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    folder = tmp_path_factory.mktemp("smooth") / "demo"
-    return nw.load_scene(write_demo(folder, width=48, height=36, views=12, points=200))
-
-
 @pytest.mark.usefixtures("one_torch_thread")
-def test_finishing_leaves_the_training_as_it_is(scene: Scene, device: torch.device) -> None:
+def test_finishing_leaves_the_training_as_it_is(tiny_scene: Scene, device: torch.device) -> None:
     """A model of its own: training goes on as if none had been asked for, on CUDA with graphs recorded anew."""
     texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
     config = Config(iterations=40, max_surfels=200, texture=texture, deterministic=device.type == "cuda")
-    asked, other = Trainer(scene, config, device), Trainer(scene, config, device)
+    asked, other = (Trainer(tiny_scene, config, device) for _ in range(2))
     # At any one step there may be no graph: where lists turn out too short, the next step drops it.
     replayed: list[bool] = []
 

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import ops
 from tests.reference.collect import Shape
 from tests.reference.surface import surface
 from tests.render_support import view_of
@@ -16,7 +15,6 @@ from tests.scenes import (
     make_camera,
     make_surfels,
     named_scene,
-    random_scene,
 )
 from tests.tolerances import FLIPS, assert_close
 
@@ -84,17 +82,3 @@ def test_surface_does_not_depend_on_max_hits(max_hits: int, device: torch.device
     out, expected = draw(scene, max_hits=max_hits), draw(scene, max_hits=2)
     for name in BUFFERS:
         assert torch.equal(getattr(out, name), getattr(expected, name)), name
-
-
-def test_normals_are_unit_face_the_camera_and_are_0_where_nothing_is_hit(device: torch.device) -> None:
-    scene = random_scene(1, device=device)
-    out = draw(scene)
-    lengths = out.normals.norm(dim=-1)
-    hit = out.alpha > 0
-    assert hit.any() and not hit.all()
-    assert_close(lengths, hit.to(lengths), kind="value", name="length")
-    for name in BUFFERS:
-        assert not getattr(out, name)[~hit].any(), name
-    camera = make_camera(scene)
-    _, rays = ops.unproject(out.depths.detach(), camera.viewmat.detach(), out.intermediates.pinhole)
-    assert ((out.normals * rays.view_as(out.normals)).sum(-1) <= 0).all()

@@ -7,13 +7,11 @@ from typing import Any
 import pytest
 import torch
 
-from nexwarp.data import Scene, load_scene
 from nexwarp.run.folder import LOG_FILE, TENSORBOARD_FOLDER
 from nexwarp.run.log import TrainingLog, keep_lines
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
-from tests.scene_writers import write_demo
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -22,14 +20,9 @@ CONFIG = Config(iterations=12, max_surfels=60, texture=TEXTURE, densify=DensifyC
 CLOCK = ("iterations_per_second", "seconds", "memory_bytes")
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Scene:
-    return load_scene(write_demo(tmp_path_factory.mktemp("logs") / "tiny", width=24, height=18, views=9, points=100))
-
-
 @pytest.fixture
-def trainer(scene) -> Trainer:
-    return Trainer(scene, CONFIG, "cpu")
+def trainer(tiny_scene) -> Trainer:
+    return Trainer(tiny_scene, CONFIG, "cpu")
 
 
 def lines(run: Path) -> list[dict[str, Any]]:
@@ -47,7 +40,7 @@ def without_clock(line: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in line.items() if name not in CLOCK}
 
 
-def test_a_line_is_what_the_step_was(trainer, scene, tmp_path):
+def test_a_line_is_what_the_step_was(trainer, tmp_path):
     seen: list[dict[str, Any]] = []
     with TrainingLog(tmp_path, trainer) as log:
 
@@ -92,13 +85,13 @@ def test_numbers_are_fetched_only_for_lines(trainer, tmp_path, total, expected):
     assert [line["iteration"] for line in lines(tmp_path)] == expected == sorted(set(fetched))
 
 
-def test_resuming_goes_on_as_if_nothing_had_happened(trainer, scene, tmp_path):
+def test_resuming_goes_on_as_if_nothing_had_happened(trainer, tiny_scene, tmp_path):
     """Lines beyond the checkpoint, and one cut off, are dropped; the rest is that of an uninterrupted run."""
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     whole.mkdir(), broken.mkdir()
     with TrainingLog(whole, trainer) as log:
         trainer.run(log)
-    first, second = (Trainer(scene, CONFIG, "cpu") for _ in range(2))
+    first, second = (Trainer(tiny_scene, CONFIG, "cpu") for _ in range(2))
     with TrainingLog(broken, first) as log:
         first.run(log, until=5)
         first.save(broken)
@@ -143,17 +136,17 @@ def events(run: Path) -> dict[str, dict[int, float]]:
     return {tag: {e.step: e.value for e in reader.Scalars(tag)} for tag in reader.Tags()["scalars"]}
 
 
-def test_tensorboard_shows_the_lines(scene, tmp_path):
+def test_tensorboard_shows_the_lines(tiny_scene, tmp_path):
     """The same values under the same steps, also after a run was resumed from an earlier iteration."""
     pytest.importorskip("tensorboard", reason="tensorboard is not installed (pip install 'nexwarp[tensorboard]')")
-    trainer = Trainer(scene, CONFIG, "cpu")
+    trainer = Trainer(tiny_scene, CONFIG, "cpu")
     with TrainingLog(tmp_path, trainer, tensorboard=True) as log:
         for _ in range(8):
             log(trainer.step())
             if trainer.iteration == 5:
                 trainer.save(tmp_path)
     assert max(events(tmp_path)["loss/total"]) == 8
-    trainer = Trainer(scene, CONFIG, "cpu")
+    trainer = Trainer(tiny_scene, CONFIG, "cpu")
     trainer.restore(tmp_path)
     with TrainingLog(tmp_path, trainer, tensorboard=True) as log:
         trainer.run(log)

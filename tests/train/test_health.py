@@ -2,15 +2,12 @@ import dataclasses
 import json
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-import nexwarp as nw
 from nexwarp.cli import main as cli
-from nexwarp.data import Scene
 from nexwarp.errors import CheckpointError, DivergedError, NexwarpError, OutOfMemoryError
 from nexwarp.machine import needed_memory
 from nexwarp.train import state, trainer
@@ -20,7 +17,6 @@ from nexwarp.train.optimizer import make_optimizer
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.report import not_finite
 from nexwarp.train.trainer import Trainer
-from tests.scene_writers import write_demo
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 
@@ -28,16 +24,6 @@ NAN, INF = math.nan, math.inf
 TEXTURE = TextureConfig(levels=2, table_size=2**6, width=8)
 SMALL = Config(iterations=40, max_surfels=60, texture=TEXTURE, densify=DensifyConfig(every=5))
 FLAGS = ["--iterations", "40", "--max-surfels", "60", "--device", "cpu"]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=24, height=18, views=6, points=100)
-
-
-@pytest.fixture(scope="module")
-def scene(folder) -> Scene:
-    return nw.load_scene(folder)
 
 
 def poison(where: str, value: float = NAN) -> Callable[[Trainer], None]:
@@ -128,10 +114,10 @@ def test_nothing_that_is_not_finite_is_ever_saved(scene, tmp_path, monkeypatch):
     assert run.iteration == 1 and not_finite(run._watched()) == []
 
 
-def test_the_command_line_names_the_fault_and_keeps_the_checkpoint(folder, tmp_path, monkeypatch, capsys):
+def test_the_command_line_names_the_fault_and_keeps_the_checkpoint(tiny_folder, tmp_path, monkeypatch, capsys):
     run = tmp_path / "run"
     inject(monkeypatch, {22}, poison("gradient surfels.means"))
-    assert cli.main(["train", str(folder), "--run", str(run), *FLAGS, "--checkpoint-every", "4"]) == 2
+    assert cli.main(["train", str(tiny_folder), "--run", str(run), *FLAGS, "--checkpoint-every", "4"]) == 2
     err = capsys.readouterr().err
     assert err.startswith("nexwarp: error: iteration 2") and err.count("\n") == 1
     assert err.endswith("; the last checkpoint stays\n")
@@ -156,7 +142,7 @@ def test_errors_of_memory_are_known(error, needed):
     assert needed_memory(error) == needed
 
 
-def test_too_little_memory_says_what_to_lower(scene, folder, tmp_path, monkeypatch, capsys):
+def test_too_little_memory_says_what_to_lower(scene, tiny_folder, tmp_path, monkeypatch, capsys):
     def fail(*_: Any, **__: Any) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has 1 KiB free")
 
@@ -164,9 +150,9 @@ def test_too_little_memory_says_what_to_lower(scene, folder, tmp_path, monkeypat
     run = Trainer(scene, dataclasses.replace(SMALL, max_surfels=48), "cpu")
     with pytest.raises(OutOfMemoryError) as caught:
         run.run()
-    for word in ("iteration 1", "needed 2.50 GiB", "24x18", "--max-surfels (now 48)", "--max-hits", "--downscale"):
+    for word in ("iteration 1", "needed 2.50 GiB", "48x36", "--max-surfels (now 48)", "--max-hits", "--downscale"):
         assert word in str(caught.value), word
-    assert cli.main(["train", str(folder), "--run", str(tmp_path / "run"), *FLAGS]) == 2
+    assert cli.main(["train", str(tiny_folder), "--run", str(tmp_path / "run"), *FLAGS]) == 2
     err = capsys.readouterr().err
     assert err.startswith("nexwarp: error: out of memory at iteration 1: it needed 2.50 GiB") and err.count("\n") == 1
 

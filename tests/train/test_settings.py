@@ -21,22 +21,17 @@ from nexwarp.train.recipe import (
     with_settings,
 )
 from tests.cli.support import refused
-from tests.scene_writers import write_blender, write_demo
+from tests.scene_writers import write_blender
 
 SHAPE = ["--set", "texture.levels=4", "--set", "texture.table_size=256", "--set", "texture.width=16"]
 FLAGS = [*SHAPE, "--iterations", "2", "--max-surfels", "50", "--device", "cpu"]
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory) -> Path:
-    return write_demo(tmp_path_factory.mktemp("scenes") / "tiny", width=24, height=18, views=9, points=100)
-
-
-@pytest.fixture(scope="module")
-def run(scene, tmp_path_factory) -> Path:
+def run(tiny_folder, tmp_path_factory) -> Path:
     run = tmp_path_factory.mktemp("runs") / "run"
     extra = ["--set", "mask_mode=background", "--set", "rates.means=[1e-4, 1e-6]", "--set", "skybox=90"]
-    assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, *extra]) == 0
+    assert cli.main(["train", str(tiny_folder), "--run", str(run), *FLAGS, *extra]) == 0
     return run
 
 
@@ -133,8 +128,8 @@ def test_settings_of_another_kind_are_refused(change):
     assert "\n" not in str(caught.value)
 
 
-def test_resume_agrees_or_is_refused(run, scene, capsys):
-    resume = ["train", str(scene), "--run", str(run), "--resume", "--device", "cpu"]
+def test_resume_agrees_or_is_refused(run, tiny_folder, capsys):
+    resume = ["train", str(tiny_folder), "--run", str(run), "--resume", "--device", "cpu"]
     assert cli.main([*resume, "--set", "texture.levels=4", "--set", "mask_mode=background"]) == 0
     # What shapes no number may change.
     assert cli.main([*resume, "--set", "cuda_graphs=false"]) == 0
@@ -153,15 +148,15 @@ def test_resume_agrees_or_is_refused(run, scene, capsys):
         (["--set", "seed=1", "--set", "seed=2"], ["--set: seed: expected it once"]),
     ],
 )
-def test_bad_flags_leave_nothing_behind(scene, tmp_path, capsys, flags, words):
+def test_bad_flags_leave_nothing_behind(tiny_folder, tmp_path, capsys, flags, words):
     run = tmp_path / "runs" / "new"
-    refused(capsys, ["train", str(scene), "--run", str(run), "--device", "cpu", *flags], *words)
+    refused(capsys, ["train", str(tiny_folder), "--run", str(run), "--device", "cpu", *flags], *words)
     assert not run.parent.exists()
 
 
-def test_a_scene_on_a_background_takes_it_from_its_flag(scene, tmp_path, capsys):
+def test_a_scene_on_a_background_takes_it_from_its_flag(tiny_folder, tmp_path, capsys):
     """Photos that were put on white must not be compared with renderings on another colour."""
-    path = write_blender(scene, tmp_path / "blender")
+    path = write_blender(tiny_folder, tmp_path / "blender")
     for file in path.rglob("*.png"):
         with Image.open(file) as photo:
             photo.putalpha(200)

@@ -30,21 +30,6 @@ def test_wrong_arguments_are_named(scene: Scene) -> None:
             nw.train(**({"scene": scene, "config": SMALL, "device": "cpu"} | wrong))
 
 
-def test_callbacks_see_each_step_and_stop_the_training(scene: Scene) -> None:
-    class Enough(Exception):
-        pass
-
-    seen: list[nw.StepReport] = []
-
-    def stop(step: nw.StepReport) -> None:
-        if step.iteration == 7:
-            raise Enough
-
-    with pytest.raises(Enough):
-        nw.train(scene, SMALL, device="cpu", callbacks=[seen.append, stop])
-    assert [step.iteration for step in seen] == [*range(1, 8)]
-
-
 def test_an_own_loss_is_added_and_reported(scene: Scene) -> None:
     targets: list[nw.Target] = []
 
