@@ -146,8 +146,7 @@ def rigid_gradient(viewmat: torch.Tensor) -> torch.Tensor:
         a, b = (axis + 1) % 3, (axis + 2) % 3
         generators[axis, b, a], generators[axis, a, b] = 1.0, -1.0
         generators[axis + 3, axis, 3] = 1.0
-    moved = generators @ viewmat.detach().double().cpu()
-    return (moved * present(viewmat.grad).double().cpu()).sum(dim=(1, 2))
+    return (generators @ viewmat.detach().double().cpu() * present(viewmat.grad).double().cpu()).sum(dim=(1, 2))
 
 
 def twin(module: torch.nn.Module | None) -> Any:

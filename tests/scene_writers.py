@@ -72,8 +72,7 @@ def write_demo(folder: str | Path, width: int, height: int, views: int, points: 
 def photograph(photo: np.ndarray, pinhole: Lens, lens: Lens, samples: int = 3) -> np.ndarray:
     """(H, W, 3) uint8 of a wall that shows `photo`, which `pinhole` took, and goes on with its edges' colours."""
     x, y = ((np.arange(side * samples) + 0.5) / samples for side in (lens.width, lens.height))
-    pixels = np.stack(np.meshgrid(x, y), axis=-1)
-    column, row = pinhole.project(lens.unproject(pixels.reshape(-1, 2))).T - 0.5
+    column, row = pinhole.project(lens.unproject(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))).T - 0.5
     channels = np.moveaxis(photo.astype(np.float64), -1, 0)
     planes = [map_coordinates(channel, (row, column), order=1, mode="nearest") for channel in channels]
     fine = np.stack(planes, axis=-1).reshape(lens.height, samples, lens.width, samples, 3)

@@ -66,8 +66,7 @@ def random_scene(
     viewmat = rigid((0.9, 0.2, -0.3, 0.1), (0.3, -0.2, 0.5))
     z = uniform(generator, count, low=2.0, high=5.0)
     x = (uniform(generator, count, high=width) - cx) / fx * z
-    y = (uniform(generator, count, high=height) - cy) / fy * z
-    centers = torch.stack([x, y, z], dim=-1)
+    centers = torch.stack([x, (uniform(generator, count, high=height) - cy) / fy * z, z], dim=-1)
     sh = 0.3 * torch.randn(count, (sh_degree + 1) ** 2, 3, generator=generator, dtype=torch.float64)
     scene = {
         "means": (centers - viewmat[:3, 3]) @ viewmat[:3, :3],
@@ -215,6 +214,5 @@ def make_texture(
     with torch.no_grad():
         texture.grid.copy_(torch.randn(texture.grid.shape, generator=generator))
         for matrix in texture.mlp.parameters():
-            size = (2.0 / matrix.shape[1]) ** 0.5
-            matrix.copy_(size * torch.randn(matrix.shape, generator=generator))
+            matrix.copy_((2.0 / matrix.shape[1]) ** 0.5 * torch.randn(matrix.shape, generator=generator))
     return texture.to(device=device, dtype=dtype)

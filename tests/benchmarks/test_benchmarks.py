@@ -15,5 +15,4 @@ def test_the_command_writes_a_measurement_a_line(tmp_path: Path) -> None:
 
 
 def test_time_of_a_gpu_counts_kernels_side_by_side_once_and_gaps_never() -> None:
-    assert busy([(5.0, 7.0), (0.0, 2.0), (1.0, 3.0), (5.5, 6.0)]) == 5.0
-    assert busy([]) == 0.0
+    assert busy([(5.0, 7.0), (0.0, 2.0), (1.0, 3.0), (5.5, 6.0)]) == 5.0 and busy([]) == 0.0

@@ -27,8 +27,7 @@ def cameras(count: int = 6, centred: bool = False) -> list[Camera]:
 
 
 def assert_same(mine: Camera, theirs: Camera) -> None:
-    assert (mine.viewmat - theirs.viewmat).abs().max() <= FAR
-    assert (mine.K - theirs.K).abs().max() <= FAR * 64
+    assert (mine.viewmat - theirs.viewmat).abs().max() <= FAR and (mine.K - theirs.K).abs().max() <= FAR * 64
     assert (mine.width, mine.height, mine.near) == (theirs.width, theirs.height, theirs.near)
 
 

@@ -90,8 +90,7 @@ def test_path_is_an_ellipse_through_the_cameras_region() -> None:
     centre = path.mean(0)
     values = torch.linalg.svdvals(path - centre) / 10.0  # of a * cos over 200 steps: a * 10
     assert values[2] < 1e-9, "the path leaves its plane"
-    assert values[0].item() == pytest.approx(3.0, rel=0.1)
-    assert values[1].item() == pytest.approx(2.0, rel=0.1)
+    assert values[0].item() == pytest.approx(3.0, rel=0.1) and values[1].item() == pytest.approx(2.0, rel=0.1)
     assert (path[:, 2].mean() - given[:, 2].mean()).abs() < 0.02
     for axis in range(2):
         low, high = torch.quantile(given[:, axis], torch.tensor([0.05, 0.95]).double())
@@ -110,8 +109,7 @@ def test_up_is_across_the_right_axes_however_cameras_are_tilted() -> None:
         assert up @ (motion[0] @ UP) > math.cos(math.radians(1.0))
     # Of cameras that all look one way, the right axes say nothing about the tilt: the mean of their own directions.
     alike = [camera(torch.tensor([x, 0.0, 0.0]), torch.tensor([x, 4.0, 0.0])) for x in (-1.0, 0.0, 1.0)]
-    assert up_direction(alike) @ UP > 1 - 1e-9
-    assert up_direction([]).tolist() == [0.0, -1.0, 0.0]
+    assert up_direction(alike) @ UP > 1 - 1e-9 and up_direction([]).tolist() == [0.0, -1.0, 0.0]
 
 
 def test_cameras_on_a_wall_or_a_line_give_a_path_along_it() -> None:
@@ -160,8 +158,7 @@ def test_a_path_through_cameras_passes_every_one_in_turn() -> None:
     assert all(error.min() < 2e-2 for error in errors)
     order = [error.argmin().item() for error in errors]
     assert order == sorted(order) and order[0] == 0 and order[-1] == 2000
-    assert errors[0][0] < 1e-9 and errors[-1][-1] < 1e-9
-    assert len(through(cameras, 1)) == 1
+    assert errors[0][0] < 1e-9 and errors[-1][-1] < 1e-9 and len(through(cameras, 1)) == 1
 
 
 @pytest.mark.parametrize("make", [through, interpolate])
@@ -257,8 +254,7 @@ def test_resized_camera_sees_the_same_from_top_to_bottom() -> None:
     for y in (0.0, 48.0):
         assert (y * 2 - wide.cy) / wide.fy == pytest.approx((y - one.cy) / one.fy)
     # The rays in the middle third of the wide picture are those of the old one.
-    assert (128 - 64 - wide.cx) / wide.fx == pytest.approx((0 - one.cx) / one.fx)
-    assert resized(one, 64, 48) is one
+    assert (128 - 64 - wide.cx) / wide.fx == pytest.approx((0 - one.cx) / one.fx) and resized(one, 64, 48) is one
     with pytest.raises(ValueError, match="height: expected at least 1, got 0"):
         resized(one, 64, 0)
     small = reduced(one, 24)

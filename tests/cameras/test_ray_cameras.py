@@ -45,8 +45,7 @@ def test_rays_of_a_pinhole_turned_anywhere_show_its_picture(device, yaw, pitch):
     for name in ("weights", "depths", "expected_depth", "median_depth", "top_depth", "normals"):
         error = (getattr(out, name) - getattr(expected, name)).abs()
         assert error.median() < 0.01 and error.mean() < 0.08, name
-    assert (out.ids == expected.ids).double().mean() > 0.93
-    assert not out.image.requires_grad
+    assert (out.ids == expected.ids).double().mean() > 0.93 and not out.image.requires_grad
 
 
 def test_panoramas_show_all_around_and_faces_meet():

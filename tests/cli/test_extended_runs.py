@@ -23,8 +23,7 @@ def extended(trained: Path, scene: Path, tmp_path_factory: pytest.TempPathFactor
 
 
 def test_a_finished_run_goes_on(extended: Path, scene: Path) -> None:
-    assert read_run(extended).config.iterations == 30
-    assert read(extended, "metrics.json")["iterations"] == 30
+    assert read_run(extended).config.iterations == 30 and read(extended, "metrics.json")["iterations"] == 30
     logged = [json.loads(line)["iteration"] for line in (extended / "metrics.jsonl").read_text().splitlines()]
     assert logged == list(range(1, 31))
     # Finished once more, and as before, by another --resume.
@@ -41,8 +40,7 @@ def test_it_is_said_and_an_interruption_changes_nothing(extended, trained, scene
         patch.setattr(Trainer, "step", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
         assert cli.main([*command, "--iterations", "30"]) == 130
     told = capsys.readouterr().out.replace("\n", " ")
-    assert "extended from 20 to 30 iterations: from here on, learning rates" in told
-    assert cli.main(command) == 0
+    assert "extended from 20 to 30 iterations: from here on, learning rates" in told and cli.main(command) == 0
     assert "extended" not in capsys.readouterr().out
     assert (run / "model.safetensors").read_bytes() == (extended / "model.safetensors").read_bytes()
 
@@ -59,5 +57,4 @@ def test_its_schedules_are_those_of_the_longer_run(trained: Path, scene: Path) -
     rates = [group["lr"] for group in trainer.optimizer.param_groups]
     set_rates(trainer.optimizer, 21, 30)
     assert rates == [group["lr"] for group in trainer.optimizer.param_groups]
-    fresh = Trainer(load_scene(scene), longer, "cpu")
-    assert trainer.densifier.config == fresh.densifier.config
+    assert trainer.densifier.config == Trainer(load_scene(scene), longer, "cpu").densifier.config

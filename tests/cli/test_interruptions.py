@@ -52,8 +52,7 @@ def test_an_interrupted_run_resumes_to_the_same_bits(trained, scene, tmp_path, c
     word = "interrupted" if name == "SIGINT" else "terminated"
     assert capsys.readouterr().err == f"nexwarp: {word}; continue with --resume\n"
     assert {f.name for f in run.iterdir()} - {"checkpoint.old"} == {"config.json", "metrics.jsonl", "checkpoint"}
-    assert read(run / "checkpoint", "state.json")["iteration"] == calls
-    assert signal.getsignal(number) == before
+    assert read(run / "checkpoint", "state.json")["iteration"] == calls and signal.getsignal(number) == before
     assert cli.main(["train", str(scene), "--run", str(run), "--device", "cpu", "--resume"]) == 0
     assert f"resumed at iteration {calls}" in capsys.readouterr().out
     assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
@@ -89,8 +88,7 @@ def test_checkpoints_that_nobody_asked_for_are_apart(scene, tmp_path, monkeypatc
     with pytest.MonkeyPatch.context() as patch:
         interrupt_after(patch, TrainingLog, "__call__", 21, signal.SIGTERM)
         assert cli.main(command) == 128 + signal.SIGTERM
-    assert saved == [8, 16, 21]
-    assert cli.main([*command, "--resume"]) == 0
+    assert saved == [8, 16, 21] and cli.main([*command, "--resume"]) == 0
     assert saved == [8, 16, 21, 32, 40]
 
 
@@ -140,8 +138,7 @@ def test_a_run_killed_before_its_first_checkpoint_starts_anew(trained, scene, tm
         aside = run / f".checkpoint.{os.getppid()}-{7:016x}.tmp"
         aside.mkdir()
         (aside / "tensors.safetensors").write_bytes(b"\x10")
-    command = ["train", str(scene), "--run", str(run), *FLAGS, "--resume"]
-    assert cli.main(command) == 0
+    assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, "--resume"]) == 0
     assert f"{run}: no checkpoint yet, training starts from the beginning" in capsys.readouterr().out
     assert {f.name for f in run.iterdir()} == RUN_FILES
     assert (run / "model.safetensors").read_bytes() == (trained / "model.safetensors").read_bytes()
@@ -160,8 +157,7 @@ def test_resuming_removes_what_killed_processes_left(finished, scene):
             os.utime(finished / name, (0, 0))
     before = snapshot(finished)
     assert cli.main(["train", str(scene), "--run", str(finished), "--device", "cpu", "--resume"]) == 0
-    assert before.keys() - snapshot(finished).keys() == set(goes)
-    assert not (finished / "export").exists()
+    assert before.keys() - snapshot(finished).keys() == set(goes) and not (finished / "export").exists()
 
 
 def test_a_resumed_run_knows_where_its_scene_lies_now(finished, scene, tmp_path):

@@ -53,8 +53,7 @@ def test_ctrl_c_while_libraries_load_prints_one_line() -> None:
     started = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ | python_path(ROOT), cwd=ROOT)
     caught = 0
     while not caught & 1 << signal.SIGINT - 1:  # Python has begun
-        status = Path(f"/proc/{started.pid}/status").read_text()
-        caught = int(re.findall(r"SigCgt:\s*(\w+)", status)[0], 16)
+        caught = int(re.findall(r"SigCgt:\s*(\w+)", Path(f"/proc/{started.pid}/status").read_text())[0], 16)
         time.sleep(0.001)
     time.sleep(0.3)
     started.send_signal(signal.SIGINT)

@@ -62,8 +62,7 @@ def test_training_says_what_it_does(scene, tmp_path, capsys):
         assert word in out, word
     assert f"next: nexwarp view {run} " in out.splitlines()[-1]
     settings = config_from_dict(read(run, "config.json")["config"])
-    assert (settings.max_hits, settings.seed) == (0, 3)
-    assert nw.load(run).options.max_hits == 0
+    assert (settings.max_hits, settings.seed) == (0, 3) and nw.load(run).options.max_hits == 0
 
 
 def test_memory_that_ends_while_finishing_costs_no_training(scene, tmp_path, monkeypatch, capsys):
@@ -75,10 +74,8 @@ def test_memory_that_ends_while_finishing_costs_no_training(scene, tmp_path, mon
         patch.setattr(Trainer, "finish", full)
         assert cli.main(command) == 2
     told = "out of memory: needed 2.00 GiB; training is complete and saved: --resume finishes the run"
-    assert capsys.readouterr().err == f"nexwarp: error: {told}\n"
-    assert cli.main([*command, "--resume"]) == 0
-    assert "resumed at iteration 20" in capsys.readouterr().out
-    assert (tmp_path / "run" / "metrics.json").is_file()
+    assert capsys.readouterr().err == f"nexwarp: error: {told}\n" and cli.main([*command, "--resume"]) == 0
+    assert "resumed at iteration 20" in capsys.readouterr().out and (tmp_path / "run" / "metrics.json").is_file()
 
 
 def test_eval_reproduces_the_metrics(finished, capsys):
@@ -87,10 +84,8 @@ def test_eval_reproduces_the_metrics(finished, capsys):
     (finished / "metrics.json").unlink()
     shutil.rmtree(finished / "renders")
     assert cli.main(["eval", str(finished), "--device", "cpu"]) == 0
-    now = read(finished, "metrics.json")
-    assert now == {key: before[key] for key in ("psnr", "ssim", "views", "convention")}
-    assert snapshot(finished / "renders") == renders
-    assert f"{before['psnr']:.2f} dB" in capsys.readouterr().out
+    assert read(finished, "metrics.json") == {key: before[key] for key in ("psnr", "ssim", "views", "convention")}
+    assert snapshot(finished / "renders") == renders and f"{before['psnr']:.2f} dB" in capsys.readouterr().out
 
 
 def test_the_table_of_photos_has_what_the_model_shows_of_each(trained, scene):
@@ -149,8 +144,7 @@ def test_eval_finds_a_scene_that_moved(finished, scene, tmp_path, capsys):
     config["scene"]["path"] = str(tmp_path / "gone")
     (finished / "config.json").write_text(json.dumps(config))
     assert cli.main(["eval", str(finished), "--device", "cpu"]) == 2
-    assert str(tmp_path / "gone") in capsys.readouterr().err
-    assert read(finished, "metrics.json") == before
+    assert str(tmp_path / "gone") in capsys.readouterr().err and read(finished, "metrics.json") == before
     assert cli.main(["eval", str(finished), "--scene", str(scene), "--device", "cpu"]) == 0
     assert read(finished, "metrics.json") == before
 
@@ -171,8 +165,7 @@ def test_a_blender_scene_through_train_resume_and_eval(tmp_path, capsys):
     config = read(run, "config.json")
     given = {"background": "0,0.5,1", "masks": "alpha", "points": str(points), "format": None}
     assert config["scene"] == {"path": str(path), "images": "images", "downscale": 1} | given | LINKS
-    assert config["config"]["background"] == [0.0, 0.5, 1.0]
-    assert nw.load(run).options.background == (0.0, 0.5, 1.0)
+    assert config["config"]["background"] == [0.0, 0.5, 1.0] and nw.load(run).options.background == (0.0, 0.5, 1.0)
     before = read(run, "metrics.json")["psnr"]
     assert cli.main(["eval", str(run), "--device", "cpu"]) == 0
     assert read(run, "metrics.json")["psnr"] == pytest.approx(before, abs=1e-6)

@@ -136,8 +136,7 @@ def test_training_photos_have_their_maps(folder: Path, monkeypatch: pytest.Monke
 def test_maps_are_never_mixed(folder: Path, monkeypatch: pytest.MonkeyPatch, downscale: int, factor: int) -> None:
     """A pixel has the value of the map where its centre lies, at an edge too."""
     size = WIDTH // factor, HEIGHT // factor
-    near = np.random.default_rng(0).random(size[::-1]) < 0.5
-    values = np.where(near, 1.5, 7.0) + np.arange(size[0]) / 64
+    values = np.where(np.random.default_rng(0).random(size[::-1]) < 0.5, 1.5, 7.0) + np.arange(size[0]) / 64
     write_maps(folder / "depths", {f"view_00{index}.png": values for index in range(4)})
     for view in load_unfitted(folder, monkeypatch, downscale=downscale).train:
         depth = present(view.depth)
@@ -240,8 +239,7 @@ def test_scale_and_shift_are_absorbed(kind: str) -> None:
     views = [seen(MAPS[kind](z, k), z, seed=k) for k, z in enumerate(depths)]
     for view, z in zip(fit_depths(views, None, Path("scene")), depths, strict=True):
         fitted = present(view.depth)
-        assert fitted.dtype == torch.float16
-        assert (fitted.float() / torch.from_numpy(z) - 1).abs().max() < 0.02
+        assert fitted.dtype == torch.float16 and (fitted.float() / torch.from_numpy(z) - 1).abs().max() < 0.02
 
 
 def test_larger_values_of_depth_maps_are_never_nearer() -> None:

@@ -36,8 +36,7 @@ def test_linear_light_is_read_as_the_srgb_that_it_is_of(tmp_path: Path) -> None:
     assert torch.allclose(display_light(light), shown / 255, atol=1e-6)
     save_exr(tmp_path / "a.exr", {"image": light})
     save_exr(tmp_path / "b.exr", {"image": 3 * light})
-    assert image_size(tmp_path / "a.exr") == (16, 16)
-    assert read_image(tmp_path / "a.exr").equal(shown)
+    assert image_size(tmp_path / "a.exr") == (16, 16) and read_image(tmp_path / "a.exr").equal(shown)
     assert read_image(tmp_path / "b.exr", 3.0).equal(shown)
     clipped = read_image(tmp_path / "b.exr")
     assert clipped.equal((display_light((3 * light).clamp(max=1)) * 255).round().byte()) and clipped.max() == 255

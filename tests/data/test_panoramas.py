@@ -114,8 +114,7 @@ def test_cameras_of_panoramas_and_photos_come_back(walls: np.ndarray, tmp_path: 
     for i in range(3):
         turn, place = turned(10.0 * i - 30.0), np.array([0.3 * i - 0.3, 0.0, -0.9])
         poses[f"x{i}.png"] = turn, place
-        shown = room(walls, place, pinhole(320)[40:280] @ turn)
-        Image.fromarray(shown).save(tmp_path / "photos" / f"x{i}.png")
+        Image.fromarray(room(walls, place, pinhole(320)[40:280] @ turn)).save(tmp_path / "photos" / f"x{i}.png")
     report = process(tmp_path / "photos", tmp_path / "scene", options=SfmOptions(camera_model="simple_pinhole"))
     assert report.panoramas == 5 and len(report.registered) == report.photos == 33
     assert {camera.params[0] for camera in report.cameras if camera.model == "PINHOLE"} == {round(WIDTH / np.pi) / 2}

@@ -7,8 +7,7 @@ from nexwarp.data.points import farthest_points, inliers, predecessor_scales
 
 
 def cloud(count: int, seed: int = 0) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    return rng.standard_normal((count, 3)) * [1.0, 2.0, 0.3] + [10.0, -5.0, 3.0]
+    return np.random.default_rng(seed).standard_normal((count, 3)) * [1.0, 2.0, 0.3] + [10.0, -5.0, 3.0]
 
 
 def brute_force_order(points: np.ndarray, count: int, start: int) -> list[int]:
@@ -23,8 +22,7 @@ def brute_force_scales(means: np.ndarray) -> np.ndarray:
     scales = []
     for index, mean in enumerate(means):
         others = means[:index] if index >= 3 else np.delete(means, index, axis=0)
-        nearest = np.sort(((others - mean) ** 2).sum(axis=1))[:3]
-        scales.append(0.5 * np.sqrt(nearest.mean()))
+        scales.append(0.5 * np.sqrt(np.sort(((others - mean) ** 2).sum(axis=1))[:3].mean()))
     return np.array(scales)
 
 
@@ -55,10 +53,8 @@ def test_scales_against_brute_force(count):
 
 
 def test_scales_are_positive():
-    assert predecessor_scales(np.zeros((1, 3))).item() > 0.0
-    assert (predecessor_scales(np.zeros((10, 3))) > 0.0).all()
-    clustered = np.concatenate([np.zeros((10, 3)), np.ones((1, 3))])
-    assert (predecessor_scales(clustered) >= 1e-6 * 3**0.5 * 0.999).all()
+    assert predecessor_scales(np.zeros((1, 3))).item() > 0.0 and (predecessor_scales(np.zeros((10, 3))) > 0.0).all()
+    assert (predecessor_scales(np.concatenate([np.zeros((10, 3)), np.ones((1, 3))])) >= 1e-6 * 3**0.5 * 0.999).all()
 
 
 def test_points_keep_their_colors_and_follow_scaling():
@@ -99,8 +95,7 @@ def test_filter_drops_planted_outliers_and_little_else():
 
 def test_filter_keeps_the_better_half():
     errors = np.arange(11.0)
-    kept = inliers(11, np.array([2] * 9 + [3, 4]), errors)
-    assert kept.tolist() == [0, 1, 2, 3, 9, 10]
+    assert inliers(11, np.array([2] * 9 + [3, 4]), errors).tolist() == [0, 1, 2, 3, 9, 10]
     # Unknown errors do not count against a point.
     errors = np.where(np.arange(100) % 2 == 0, -1.0, 0.5)
     assert len(inliers(100, None, errors)) == 100

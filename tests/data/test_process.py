@@ -68,8 +68,7 @@ def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
     folder = tmp_path / "frames"
     folder.mkdir()
     choice = take_frames(path, 5, folder, silent)
-    assert set(choice.chosen) == sharp
-    assert (choice.frames, choice.blurred, choice.duplicates) == (25, [], [])
+    assert set(choice.chosen) == sharp and (choice.frames, choice.blurred, choice.duplicates) == (25, [], [])
     assert sorted(f.name for f in folder.iterdir()) == [f"frame_{i:06d}.jpg" for i in sorted(sharp)]
     assert len(take_frames(path, 1000, tmp_path, silent).chosen) <= 25
 
@@ -145,8 +144,7 @@ def test_bad_videos_are_one_line_and_leave_nothing(tmp_path: Path, capsys: pytes
 def test_a_clip_becomes_a_scene(tmp_path: Path) -> None:
     """Nine tenths of the frames kept are registered."""
     report = process(Path(__file__).parent / "photos" / "walk.mp4", tmp_path / "scene", 12)
-    assert report.frames is not None
-    assert len(report.registered) >= 0.9 * len(report.frames.chosen) >= 0.9 * 12
+    assert report.frames is not None and len(report.registered) >= 0.9 * len(report.frames.chosen) >= 0.9 * 12
     scene = load_scene(tmp_path / "scene")
     assert len(scene.train) + len(scene.test) == len(report.registered)
     notes = json.loads((tmp_path / "scene" / "sfm.json").read_text())

@@ -21,8 +21,7 @@ def pose(index: int) -> np.ndarray:
     """(3, 4) world to camera on a circle of radius 2 around the origin, looking at it."""
     angle = 0.37 * index
     forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
-    right = np.array([forward[1], -forward[0], 0.0])
-    rotation = np.stack([right, np.array([0.0, 0.0, -1.0]), forward])
+    rotation = np.stack([np.array([forward[1], -forward[0], 0.0]), np.array([0.0, 0.0, -1.0]), forward])
     return np.concatenate([rotation, rotation @ (2.0 * forward)[:, None]], axis=1)
 
 
@@ -158,8 +157,7 @@ def test_scale_is_the_reach_of_the_training_cameras(tmp_path):
     camera = scene.train[0].camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (41.0, 41.0, 20.5, 19.75)
     centres = torch.stack([view.camera.position for view in scene.train]).double()
-    reach = (centres - centres.mean(dim=0)).norm(dim=1).max().item()
-    assert scene.scale == pytest.approx(1.1 * reach, rel=1e-5)
+    assert scene.scale == pytest.approx(1.1 * (centres - centres.mean(dim=0)).norm(dim=1).max().item(), rel=1e-5)
 
 
 def test_scale_of_a_turning_camera_is_the_distance_of_the_points(tmp_path):

@@ -116,8 +116,7 @@ def assert_cameras_agree(model: Capture, truth: dict[str, np.ndarray], within: f
     R = U @ sign @ Vt
     scale = np.trace(np.diag(D) @ sign) / (dx**2).sum()
     assert np.linalg.norm(scale * dx @ R.T - dy, axis=1).max() < within * DISTANCE
-    turned = ours[:, :3, :3] @ R.T
-    assert np.linalg.norm(turned - theirs[:, :3, :3], ord=2, axis=(1, 2)).max() < within
+    assert np.linalg.norm(ours[:, :3, :3] @ R.T - theirs[:, :3, :3], ord=2, axis=(1, 2)).max() < within
 
 
 def test_cameras_come_back_and_the_scene_holds_the_photos(made, photos, arc):
@@ -126,8 +125,7 @@ def test_cameras_come_back_and_the_scene_holds_the_photos(made, photos, arc):
     assert [photo.name for photo in model.photos] == sorted(arc.images)
     assert_cameras_agree(model, arc.viewmats, within=0.01)
     for photo in model.photos:
-        assert (photo.lens.width, photo.lens.height) == (WIDTH, HEIGHT)
-        assert photo.lens.model == "SIMPLE_PINHOLE"
+        assert (photo.lens.width, photo.lens.height) == (WIDTH, HEIGHT) and photo.lens.model == "SIMPLE_PINHOLE"
         assert photo.lens.params[0] == pytest.approx(FOCAL, rel=0.02)
     assert {entry.name for entry in made.iterdir()} == {"images", "sparse", "sfm.json"}
     assert {entry.name for entry in made.parent.iterdir()} == {"scene"}
@@ -222,11 +220,9 @@ def test_distortion_is_found_and_taken_out(arc, tmp_path):
         bent[name] = np.stack(channels, axis=-1).reshape(image.shape)
     folder = write_photos(tmp_path / "bent", bent)
     report = process(folder, tmp_path / "scene", options=SfmOptions(camera_model="simple_radial"))
-    assert len(report.registered) == VIEWS
-    assert report.cameras[0].params[3] == pytest.approx(K1, abs=0.03)
+    assert len(report.registered) == VIEWS and report.cameras[0].params[3] == pytest.approx(K1, abs=0.03)
     assert_cameras_agree(read_model(tmp_path / "scene", tmp_path / "scene" / "images"), arc.viewmats, within=0.01)
-    scene = load_scene(tmp_path / "scene")
-    shape = scene.train[0].image.shape
+    shape = load_scene(tmp_path / "scene").train[0].image.shape
     assert shape[:2] != (HEIGHT, WIDTH) and report.sizes == [(shape[1], shape[0])]
 
 
@@ -367,8 +363,7 @@ ADVICE = [
 
 @pytest.mark.parametrize(("found", "registered", "text"), ADVICE)
 def test_advice_fits_the_trouble(found, registered, text):
-    assert any(text in line for line in advise(found, registered))
-    assert advise(found, len(found.features)) == []
+    assert any(text in line for line in advise(found, registered)) and advise(found, len(found.features)) == []
 
 
 def test_every_photo_left_out_has_its_reason():
@@ -468,8 +463,7 @@ def test_what_exists_is_replaced_only_when_asked(made, photos, tmp_path, capsys)
     after = snapshot(tmp_path)
     assert json.loads(after["scene/sfm.json"])["options"]["seed"] == 1
     changed = {name for name in before if before[name] != after.get(name)} - {"scene/sfm.json"}
-    assert all(name.startswith("scene/sparse/") for name in changed)
-    assert after.keys() == before.keys()
+    assert all(name.startswith("scene/sparse/") for name in changed) and after.keys() == before.keys()
     assert {entry.name for entry in tmp_path.iterdir()} == {"scene", "precious", "strangers"}
 
 
@@ -594,8 +588,7 @@ def test_a_limit_of_file_sizes_is_one_line_and_leaves_nothing(photos, tmp_path):
     command = [sys.executable, "-c", code, "process", str(photos), str(tmp_path / "scene")]
     done = subprocess.run(command, env=os.environ | python_path(ROOT), capture_output=True, text=True, timeout=120)
     told = f"nexwarp: error: {tmp_path / 'scene'}: cannot be written (File too large)\n"
-    assert (done.returncode, done.stderr) == (2, told)
-    assert not list(tmp_path.iterdir())
+    assert (done.returncode, done.stderr) == (2, told) and not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a process group is ended there")

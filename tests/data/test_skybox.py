@@ -55,8 +55,7 @@ def test_directions_are_even() -> None:
     torch.testing.assert_close(found.norm(dim=1), torch.ones(500, dtype=torch.float64))
     nearest = torch.cdist(found, found).fill_diagonal_(9.0).min(dim=1).values
     spacing = math.sqrt(4 * math.pi / 500)
-    assert nearest.min() > 0.7 * spacing and nearest.max() < 1.2 * spacing
-    assert found.mean(0).norm() < 0.01
+    assert nearest.min() > 0.7 * spacing and nearest.max() < 1.2 * spacing and found.mean(0).norm() < 0.01
 
 
 def test_points_are_where_photos_show_the_sphere(scene: Scene) -> None:
@@ -138,8 +137,7 @@ def test_some_initial_surfels_face_the_scene_a_sixth_at_most(scene: Scene, skybo
     assert len(surfels) == min(200, len(without) + count)
     torch.testing.assert_close(surfels.means[-count:], sky.means)
     torch.testing.assert_close(surfels.scales[-count:], sky.scales[:, None].expand(-1, 2))
-    facing = (rotations(surfels.quats)[-count:, :, 2] * sky.normals).sum(-1).abs()
-    assert facing.min() > 1 - 1e-4
+    assert (rotations(surfels.quats)[-count:, :, 2] * sky.normals).sum(-1).abs().min() > 1 - 1e-4
     torch.testing.assert_close(surfels.means[:-count], without.means[: len(surfels) - count])
     behind = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))
     transparent = initial_surfels(behind, config, torch.Generator().manual_seed(0))

@@ -50,8 +50,7 @@ def test_photos_fetched_ahead_are_the_photos(monkeypatch: Any):
     load = torch.rand(1024, 1024, device="cuda")
     seen = []
     for step, index in enumerate(order):
-        ahead = order[step + 1 : step + 4] if step % 5 else [(index + 5) % 12]
-        _, photo = mine.get(index, ahead)
+        _, photo = mine.get(index, order[step + 1 : step + 4] if step % 5 else [(index + 5) % 12])
         load = load @ load / load.norm()
         seen.append((index, (photo * 255.0).round().byte()))
         assert len(mine.coming) <= 2

@@ -80,8 +80,7 @@ def run_info(monkeypatch: pytest.MonkeyPatch, error: BaseException, arguments: s
     ],
 )
 def test_every_error_is_one_line(monkeypatch, capsys, error, code, line):
-    assert run_info(monkeypatch, error) == code
-    assert capsys.readouterr() == ("", f"nexwarp: {line}\n")
+    assert run_info(monkeypatch, error) == code and capsys.readouterr() == ("", f"nexwarp: {line}\n")
 
 
 @pytest.mark.parametrize("arguments", ["--debug info run", "info run --debug"])
@@ -110,8 +109,7 @@ def wait(*_):
 cli.Info.__call__ = wait
 sys.exit(cli.main(["info", "run"]))
 """
-    root = Path(__file__).parents[2]
-    environment = os.environ | python_path(root)
+    environment = os.environ | python_path(Path(__file__).parents[2])
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 143 and done.stderr.splitlines()[-1] == "nexwarp: terminated"
     assert os.listdir(tmp_path) == []

@@ -75,13 +75,11 @@ def test_training_from_tensors_raises_the_psnr(tmp_path: Path) -> None:
     out = run("train_from_tensors", "--steps", 60, "--downscale", 4, "--out", tmp_path)
     steps = numbers(r"step \d+: ([\d.]+) dB", out)
     (test,) = numbers(r"test views: ([\d.]+) dB", out)
-    assert steps[-1] > steps[0] + 2.0 and test > steps[0] + 2.0
-    assert len(nw.load(tmp_path).surfels) > 100
+    assert steps[-1] > steps[0] + 2.0 and test > steps[0] + 2.0 and len(nw.load(tmp_path).surfels) > 100
 
 
 def test_the_own_loss_falls() -> None:
-    out = run("own_loss", "--steps", 60)
-    first, first_psnr, last, last_psnr = numbers(r"edge loss ([\d.]+), ([\d.]+) dB", out)
+    first, first_psnr, last, last_psnr = numbers(r"edge loss ([\d.]+), ([\d.]+) dB", run("own_loss", "--steps", 60))
     assert last < first and last_psnr > first_psnr
 
 
@@ -93,8 +91,7 @@ def test_the_loss_falls_by_the_tape_alone() -> None:
 def test_the_pose_is_recovered(model: Path) -> None:
     out = run("refine_pose", "--model", model, "--steps", 60)
     errors = numbers(r"pose error ([\d.]+) degrees, ([\d.]+) world units", out)
-    assert errors[0] > 1.0 and errors[-2] < errors[0] / 10
-    assert errors[-1] < errors[1] / 5
+    assert errors[0] > 1.0 and errors[-2] < errors[0] / 10 and errors[-1] < errors[1] / 5
 
 
 def test_depth_and_normals_are_those_of_the_rendering(model: Path, tmp_path: Path, tiny_scene: Scene) -> None:

@@ -57,8 +57,7 @@ def parsed(file: Path) -> Any:
 
 def flat(data: dict[str, Any], *parts: str) -> set[str]:
     """Keys, those of the named parts with a dot."""
-    inner = {f"{part}.{key}" for part in parts for key in data[part]}
-    return {key for key in data if key not in parts} | inner
+    return {key for key in data if key not in parts} | {f"{part}.{key}" for part in parts for key in data[part]}
 
 
 def test_files(run):
@@ -184,8 +183,7 @@ def test_the_readme_s_python_runs(execute, capsys):
     (names,) = execute("README.md")
     assert names["lines"] <= 12
     shapes = "torch.Size([36, 48, 3]) torch.Size([36, 48]) torch.Size([36, 48, 3]) torch.Size([36, 48])"
-    assert capsys.readouterr().out.splitlines()[0] == shapes
-    assert names["model"].surfels.means.grad.norm() > 0
+    assert capsys.readouterr().out.splitlines()[0] == shapes and names["model"].surfels.means.grad.norm() > 0
 
 
 def test_the_depth_page_s_python_runs(execute):

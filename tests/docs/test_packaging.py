@@ -65,8 +65,7 @@ def test_an_editable_package_is_found_in_the_folder_above_the_clone(tmp_path: Pa
 def test_the_version_has_one_value() -> None:
     written = re.search(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.M)
     cited = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.M)
-    assert written is not None and cited is not None
-    assert written[1] == cited[1] == nexwarp.__version__
+    assert written is not None and cited is not None and written[1] == cited[1] == nexwarp.__version__
 
 
 def test_the_readme_on_pypi_links_to_files_that_exist() -> None:

@@ -102,8 +102,7 @@ def test_splats_are_flat_gaussians(tmp_path: Path, given: int, kept: int) -> Non
 @pytest.mark.parametrize("degree", [0, 3])
 def test_gltf_holds_the_gaussians_of_the_ply(tmp_path: Path, degree: int) -> None:
     """By the ratified KHR_gaussian_splatting: linear scales, opacities in [0, 1], quaternions xyzw."""
-    surfels = make_surfels(random_scene(sh_degree=3))
-    splats = gaussians(surfels, degree, [CAMERA])
+    splats = gaussians(make_surfels(random_scene(sh_degree=3)), degree, [CAMERA])
     save_splats_ply(tmp_path / "a.ply", splats)
     save_splats_glb(tmp_path / "a.glb", splats, [CAMERA])
     columns, content = read(tmp_path / "a.ply"), (tmp_path / "a.glb").read_bytes()
@@ -135,8 +134,7 @@ def test_gltf_holds_the_gaussians_of_the_ply(tmp_path: Path, degree: int) -> Non
     assert found[names[0]].equal(stack(columns, *numbered("f_dc", 3)))
     rest = stack(columns, *numbered("f_rest", 45)).view(-1, 3, 15)
     assert all(found[name].equal(rest[..., i]) for i, name in enumerate(names[1:]))
-    shown = (0.5 + 0.28209479177387814 * found[names[0]]).clamp(0, 1)
-    linear = (found["COLOR_0"][:, :3] - shown.pow(2.2)).abs()
+    linear = (found["COLOR_0"][:, :3] - (0.5 + 0.28209479177387814 * found[names[0]]).clamp(0, 1).pow(2.2)).abs()
     assert linear.max() < 0.01 and found["COLOR_0"][:, 3:].equal(found["OPACITY"])
     with pytest.raises(FormatError, match="expected surfels"):
         save_splats_glb(tmp_path / "none.glb", gaussians(make_surfels(random_scene(0))), [CAMERA])
@@ -261,16 +259,14 @@ def test_a_surface_outlasts_some_views_that_see_past_it_but_not_many(past, kept,
     mesh = fused([(camera, torch.full((128, 128), z, device=device)) for z in [2.0] * 2 + [2.9] * past])
     viewmat = camera.viewmat.double().cpu().numpy()
     z = mesh.vertices @ viewmat[2, :3] + viewmat[2, 3]
-    assert (np.abs(z - 2.9) < VOXEL).sum() > 1000
-    assert ((np.abs(z - 2) < 4 * VOXEL).sum() > 1000) == kept
+    assert (np.abs(z - 2.9) < VOXEL).sum() > 1000 and ((np.abs(z - 2) < 4 * VOXEL).sum() > 1000) == kept
 
 
 def test_a_sphere_is_a_sphere_and_closed_across_blocks(sphere):
     """Within a fifth of a voxel, with normals and triangles that face outwards, and the photos' colour."""
     radii = np.linalg.norm(sphere.vertices, axis=1)
     assert np.abs(radii - RADIUS).mean() < 0.2 * VOXEL and np.abs(radii - RADIUS).max() < VOXEL
-    outward = sphere.vertices / radii[:, None]
-    assert (sphere.normals * outward).sum(1).min() > 0.5
+    assert (sphere.normals * (sphere.vertices / radii[:, None])).sum(1).min() > 0.5
     a, b, c = (sphere.vertices[sphere.triangles[:, i]] for i in range(3))
     assert (np.cross(b - a, c - a) * a).sum(1).min() >= -1e-9
     assert np.abs(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2 / (4 * np.pi) - 1) < 0.05

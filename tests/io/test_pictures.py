@@ -53,8 +53,7 @@ def test_error_map_runs_from_violet_to_yellow_at_a_quarter() -> None:
 def test_strip_holds_the_images_and_white_gaps() -> None:
     a, b = torch.randint(255, (5, 4, 3), dtype=torch.uint8), torch.rand(5, 7, 3)
     strip = side_by_side([a, b], gap=3)
-    assert strip.shape == (5, 14, 3)
-    assert strip[:, :4].equal(a) and strip[:, 7:].equal(to_uint8(b))
+    assert strip.shape == (5, 14, 3) and strip[:, :4].equal(a) and strip[:, 7:].equal(to_uint8(b))
     assert strip[:, 4:7].eq(255).all()
     captioned = side_by_side([a, b], captions=["truth", ""])
     assert captioned.shape == (21, 15, 3) and captioned[16:].equal(side_by_side([a, b]))

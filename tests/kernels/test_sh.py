@@ -66,8 +66,7 @@ def test_plain_colors_agree_with_the_reference(stored, degree, dtype, device):
 @pytest.mark.usefixtures("poisoned_memory")
 def test_coefficients_above_the_degree_have_zero_gradients(stored: int, degree: int, device: torch.device) -> None:
     """All others have some. Memory that no kernel wrote would show as NaN."""
-    leaves = make(300, stored, torch.float32, device)
-    grad_sh0, grad_shN, _, _ = gradients(leaves, degree)
+    grad_sh0, grad_shN, _, _ = gradients(make(300, stored, torch.float32, device), degree)
     used = (degree + 1) ** 2 - 1
     assert grad_shN[:, used:].eq(0).all() and grad_shN[:, :used].ne(0).any(dim=2).any(dim=0).all()
     assert grad_sh0.any()

@@ -37,5 +37,4 @@ def test_no_block_culls_what_one_of_its_pixels_hits(seed: int) -> None:
     culled, hits = (wp.zeros((count, BLOCKS), dtype=wp.int32, device="cpu") for _ in range(2))
     wp.launch(visit_blocks, (count, BLOCKS), [argument], [culled, hits], device="cpu")
     spared, hit_pixels = culled.numpy().astype(bool), hits.numpy()
-    assert hit_pixels.any() and not hit_pixels[spared].any()
-    assert spared.sum() > 0.95 * (hit_pixels == 0).sum()
+    assert hit_pixels.any() and not hit_pixels[spared].any() and spared.sum() > 0.95 * (hit_pixels == 0).sum()

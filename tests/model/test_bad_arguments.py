@@ -96,8 +96,7 @@ def test_bad_surfels(argument: str, error: type[Exception], spoil: Callable[[Any
     scene = random_scene(8)
     values = {key: scene[key] for key in SURFEL_KEYS}
     nw.Surfels.from_activated(**values)
-    spoiled = values | {argument: spoil(values[argument])}
-    assert_refused(error, argument, nw.Surfels.from_activated, **spoiled)
+    assert_refused(error, argument, nw.Surfels.from_activated, **values | {argument: spoil(values[argument])})
 
 
 def test_surfels_are_fresh_leaves() -> None:

@@ -59,8 +59,7 @@ def test_a_compact_model_looks_the_same(tmp_path: Path) -> None:
     camera = make_camera(random_scene(24))
     with torch.no_grad():
         images = [to_uint8(m.render(camera).image) for m in (model, loaded)]
-    assert images[0].float().std() > 10
-    assert psnr(images[1], images[0]) > 50
+    assert images[0].float().std() > 10 and psnr(images[1], images[0]) > 50
     assert loaded.meta["format_version"] == COMPACT_VERSION
     assert (loaded.options, len(loaded.surfels)) == (model.options, 300)
 
@@ -81,8 +80,7 @@ def test_every_number_is_within_half_a_step(tmp_path: Path) -> None:
             reach = ((values - middle) ** 2 + spread**2).sqrt()
             assert bool((error <= 0.51 * step * reach + 1e-6).all())
         elif name == "texture.grid":  # without a sensitivity, a step in every direction
-            steps = coded[name + CODE][:, 1:].amax((1, 2))
-            assert bool((error <= 0.51 * steps[:, None, None]).all())
+            assert bool((error <= 0.51 * coded[name + CODE][:, 1:].amax((1, 2))[:, None, None]).all())
         elif name in STEPS:
             assert bool((coded[name + CODE][1] <= NOISE * STEPS[name] + 1e-9).all()), name
             assert bool((error <= 0.51 * coded[name + CODE][1]).all()), name
@@ -98,8 +96,7 @@ def test_the_grid_gets_the_noise_that_is_asked_for(features: int, residual: bool
     texture.resolutions.copy_(torch.tensor([4.0, 9.0, 20.0]))
     mixed = torch.randn(3, 2**10, features) @ torch.randn(features, features) + 2.0
     texture.grid.data = mixed * torch.tensor([0.1, 1.0, 3.0])[:, None, None]
-    model = nw.Model(make_surfels(random_scene(60)), texture)
-    sensitivity = texture_sensitivity(model)
+    sensitivity = texture_sensitivity(nw.Model(make_surfels(random_scene(60)), texture))
     points, directions = torch.rand(4000, 3) * 2 - 1, torch.nn.functional.normalize(torch.randn(4000, 3))
 
     def colors(grid: torch.Tensor) -> torch.Tensor:
@@ -159,8 +156,7 @@ def test_files_of_version_2_still_load(tmp_path: Path) -> None:
             value, expected[name] = compact.surfels.quats.detach(), full.surfels.quats.detach()
         assert float((value - expected[name]).abs().max()) <= 0.01 * float(expected[name].abs().max()), name
     assert compact.options == full.options
-    again = nw.load(compact.save(tmp_path, compact=True))
-    assert again.meta["format_version"] == COMPACT_VERSION
+    assert nw.load(compact.save(tmp_path, compact=True)).meta["format_version"] == COMPACT_VERSION
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -174,8 +170,7 @@ def test_few_surfels(tmp_path: Path, count: int) -> None:
 
 def test_extreme_values_harm_no_others(tmp_path: Path) -> None:
     """One far or transparent surfel leaves the coding of the others as fine as it was."""
-    model = make_model(200)
-    tensors = full_tensors(model, tmp_path)
+    tensors = full_tensors(make_model(200), tmp_path)
     wild = {name: x.clone() for name, x in tensors.items()}
     wild["surfels.means"][0] = torch.tensor([1e6, -1e6, 1e6])
     wild["surfels.logit_opacities"][0] = -9000.0

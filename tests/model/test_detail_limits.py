@@ -45,8 +45,7 @@ def test_a_closer_look_finds_the_detail_of_training(device: torch.device) -> Non
     surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
     texture.half_precision = False
     plain = nw.render(surfels, texture, camera, max_hits=3)
-    near = limits(surfels, nearest=3.5 / camera.focal)
-    out = limited(surfels, texture, camera, near, max_hits=3)
+    out = limited(surfels, texture, camera, limits(surfels, nearest=3.5 / camera.focal), max_hits=3)
     assert_same(out, plain, ("plain", "depths", "weights", "alpha"))
     expected = textured_at(texture, camera, out, out.depths.clamp_min(3.5))
     assert_close(out.textured, expected, kind="value", name="textured")
@@ -75,8 +74,7 @@ def test_looks_as_far_as_training_had_are_its_own(device: torch.device) -> None:
     surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
     before = nw.render(surfels, texture, camera)
     for farthest in (1.01 * before.depths.max().item() + 3.0, NEVER):
-        wide = limits(surfels, nearest=1e-6, farthest=farthest / camera.focal)
-        after = limited(surfels, texture, camera, wide)
+        after = limited(surfels, texture, camera, limits(surfels, nearest=1e-6, farthest=farthest / camera.focal))
         for name in ("image", "textured", "weights", "depths", "ids", "alpha"):
             assert torch.equal(getattr(after, name), getattr(before, name)), name
 
@@ -94,16 +92,14 @@ def test_a_far_surfel_covers_what_it_covers_wherever_pixels_fall(device: torch.d
         found = []
         for x, y in torch.rand(40, 2, generator=generator).tolist():
             K = torch.tensor([[focal, 0.0, 8 + x], [0.0, focal, 8 + y], [0.0, 0.0, 1.0]])
-            camera = nw.Camera(torch.eye(4), K, 16, 16).to(device)
-            out = limited(surfels, None, camera, training)
+            out = limited(surfels, None, nw.Camera(torch.eye(4), K, 16, 16).to(device), training)
             found.append(out.alpha.detach().sum().item())
         return torch.tensor(found)
 
     area = opacity * 2 * torch.pi * scale * (2 * scale) * (focal / 2) ** 2
     aliased = sums(None)
     filtered = sums(limits(surfels, farthest=0.1 / focal))  # training was 20 times as close
-    assert aliased.std() > area
-    assert (filtered.mean() - area).abs() < 0.1 * area and filtered.std() < 0.2 * area
+    assert aliased.std() > area and (filtered.mean() - area).abs() < 0.1 * area and filtered.std() < 0.2 * area
 
 
 def test_far_looks_are_differentiable_in_the_camera(device: torch.device) -> None:
@@ -117,8 +113,7 @@ def test_far_looks_are_differentiable_in_the_camera(device: torch.device) -> Non
 
     viewmat = camera.viewmat.detach().clone().requires_grad_()
     (wide, *_), (narrow, *_) = shape(viewmat), surfels.activated()[2:]
-    assert 0.3 < (wide > narrow).double().mean() < 1
-    assert torch.autograd.gradcheck(shape, viewmat)
+    assert 0.3 < (wide > narrow).double().mean() < 1 and torch.autograd.gradcheck(shape, viewmat)
 
 
 def test_limits_are_those_of_the_closest_and_the_farthest_look(device: torch.device) -> None:

@@ -59,15 +59,13 @@ def test_a_crop_keeps_what_lies_inside_in_the_coordinates_before_it():
     means = surfels.means.detach().double().numpy()
     box = tuple(np.quantile(means, (0.1, 0.8), axis=0).ravel().tolist())
     within = np.array([all(low <= x <= high for low, x, high in zip(box[:3], p, box[3:], strict=True)) for p in means])
-    assert 0 < within.sum() < 40
-    assert (kept_surfels(surfels, [Edit("box", box)]) == within).all()
+    assert 0 < within.sum() < 40 and (kept_surfels(surfels, [Edit("box", box)]) == within).all()
     centre = np.median(means, axis=0)
     near = np.linalg.norm(means - centre, axis=1) <= 0.8
     edits = [Edit("scale", (2.0,)), Edit("origin", tuple((2 * centre).tolist())), Edit("sphere", (0, 0, 0, 1.6))]
     assert (kept_surfels(surfels, [*edits, Edit("scale", (9.0,))]) == near).all(), "later edits move what is left"
     kept, frame = kept_surfels(surfels, edits), frame_of(edits)
-    assert 0 < near.sum() < 40 and (kept == near).all()
-    assert np.allclose(frame.points(means), 2 * (means - centre))
+    assert 0 < near.sum() < 40 and (kept == near).all() and np.allclose(frame.points(means), 2 * (means - centre))
     assert inside("sphere", (*centre, 0.8), means).sum() == near.sum()
 
 

@@ -93,8 +93,7 @@ def test_gains_are_found_up_to_their_mean():
     for outliers, bound in ((0.0, 0.01), (0.2, 0.02)):
         found, falloff = photo_gains(*photographs(expected, outliers))
         assert abs(falloff[0]) + abs(falloff[1]) < 0.03  # the lens is even
-        assert abs(found.mean(0)).max() < 1e-6
-        assert abs(found - expected.numpy()).max() < bound
+        assert abs(found.mean(0)).max() < 1e-6 and abs(found - expected.numpy()).max() < bound
 
 
 @pytest.mark.parametrize("lens", [(-0.5, 0.0), (-0.1, -1.0), (0.3, -1.8)])
@@ -109,8 +108,7 @@ def test_the_falloff_of_the_lens_is_found(lens):
     exposures = Exposures.of(torch.from_numpy(found), cameras, falloff)
     row, column = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
     expected = light(camera, torch.stack([column, row], -1).reshape(-1, 2), lens).reshape(48, 64, 1)
-    assert expected.min() < 0.85
-    assert (present(exposures.falloff_of(camera)) / expected - 1).abs().max() < 0.01
+    assert expected.min() < 0.85 and (present(exposures.falloff_of(camera)) / expected - 1).abs().max() < 0.01
 
 
 def test_the_falloff_is_the_angle_s():
@@ -121,8 +119,7 @@ def test_the_falloff_is_the_angle_s():
     assert whole.shape == (48, 64, 1) and whole.max() > 0.999
     torch.testing.assert_close(present(exposures.falloff_of(cameras[0].crop(10, 5, 20, 30))), whole[5:35, 10:30])
     K2 = K * torch.tensor([[3.0], [3.0], [1.0]])
-    fine = present(exposures.falloff_of(Camera(torch.eye(4), K2, 192, 144)))
-    torch.testing.assert_close(fine[1::3, 1::3], whole)
+    torch.testing.assert_close(present(exposures.falloff_of(Camera(torch.eye(4), K2, 192, 144)))[1::3, 1::3], whole)
     wide = present(exposures.falloff_of(cameras[0].crop(-500, -500, 1000, 1000)))
     assert wide.min().item() == pytest.approx(np.exp(-0.3)) and wide[0, 0] == wide.min()
     assert Exposures.of(torch.zeros(2, 3), cameras).falloff_of(cameras[0]) is None
@@ -139,8 +136,7 @@ def test_known_gains_are_found_beside_saturated_skies():
     gains = torch.linspace(-0.5, 0.5, 11)[:, None].expand(11, 3).double()
     cameras, photos, points = photographs(gains)
     sky = [torch.where((p > 0) & (torch.arange(48)[:, None, None] < 16), (p * 2.0).clamp(max=255), p) for p in photos]
-    seen = observations(views(cameras, [p.to(torch.uint8) for p in sky], points))
-    fit = present(choose_fit(seen, cameras))
+    fit = present(choose_fit(observations(views(cameras, [p.to(torch.uint8) for p in sky], points)), cameras))
     assert np.abs(np.exp(fit.gains - gains.numpy()) - 1).max() < 0.02 and (fit.lens == 0).all()
 
 
@@ -199,8 +195,7 @@ def test_gains_are_the_least_squares_of_photos_and_points_together(monkeypatch, 
 
 def test_photos_that_share_nothing_keep_their_colours():
     cameras, photos, points = photographs(torch.tensor([[0.2] * 3, [-0.2] * 3]))
-    nothing = [points[0][:0]] * 2
-    assert choose_fit(observations(views(cameras, photos, nothing)), cameras) is None
+    assert choose_fit(observations(views(cameras, photos, [points[0][:0]] * 2)), cameras) is None
     apart = [points[0][:100], points[1] + 1e-3]  # no point twice
     assert abs(photo_gains(cameras, photos, apart)[0]).max() < 1e-6
     white = [torch.full_like(photo, 255) for photo in photos]
@@ -211,8 +206,7 @@ def test_a_camera_gets_the_gains_around_it():
     cameras = [looking(x) for x in np.linspace(0, 6, 25)]
     course = 0.3 * torch.sin(torch.linspace(0, 6, 25))[:, None] * torch.tensor([1.0, 0.5, -1.0])
     exposures = Exposures.of(course, cameras)
-    there = torch.stack([exposures.gains(camera).log() for camera in cameras])
-    assert (there - course).abs().max() < 0.01
+    assert (torch.stack([exposures.gains(camera).log() for camera in cameras]) - course).abs().max() < 0.01
     low, high = course.min(0).values, course.max(0).values
     for x in np.linspace(0.1, 5.9, 50):  # between the photos, too
         expected = 0.3 * np.sin(x) * torch.tensor([1.0, 0.5, -1.0])
@@ -299,8 +293,7 @@ def test_training_takes_exposures_out(tmp_path):
     expected -= expected.mean()
     _, without = trained(scene, exposures=False)
     model, figure = trained(scene, exposures=True)
-    assert (present(model.exposures).log_gains - expected[:, None]).abs().max() < 0.03
-    assert figure > without + 0.5
+    assert (present(model.exposures).log_gains - expected[:, None]).abs().max() < 0.03 and figure > without + 0.5
 
 
 @pytest.mark.parametrize("change", [{"exposures": False}, {"mask_mode": "background"}])

@@ -288,8 +288,7 @@ def test_threads_take_turns() -> None:
         try:
             with torch.no_grad(), torch.cuda.stream(torch.cuda.Stream()):
                 for _ in range(30):
-                    out = model.render(views[index])
-                    assert_same(out, expected[index], (*BUFFERS, "ids"))
+                    assert_same(model.render(views[index]), expected[index], (*BUFFERS, "ids"))
         except BaseException as error:
             wrong.append(repr(error))
 

@@ -116,8 +116,7 @@ def test_changes_are_options_of_one_rendering(device: torch.device) -> None:
     expected = draw(model.surfels, None, camera, options, limits=model.detail_limits)
     assert_same(out, expected)
     assert model.options is before
-    behind = torch.tensor([1.0, 0.0, 0.0], device=device)
-    red = model.render(camera, background=behind, exposure="mean").image
+    red = model.render(camera, background=torch.tensor([1.0, 0.0, 0.0], device=device), exposure="mean").image
     assert torch.equal(red, model.render(camera, background=(1.0, 0.0, 0.0), exposure="mean").image)
 
 

@@ -57,8 +57,7 @@ def colors(surfels: Surfels, views: list[View], sh: tuple[torch.Tensor, torch.Te
 
 def test_directions_count_by_the_weight_that_surfels_have_there(device: torch.device) -> None:
     """Weights are the derivatives of the picture's sum by the surfels' colours; pixels beyond the mask do not count."""
-    scene = random_scene(20, device=device)
-    surfels = make_surfels(scene)
+    surfels = make_surfels(random_scene(20, device=device))
     mask = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     mask[:, : SIDE // 2] = True
     views = [*around([0.0, 0.7]), view([0.5, -0.5, -4.0], mask)]
@@ -69,8 +68,7 @@ def test_directions_count_by_the_weight_that_surfels_have_there(device: torch.de
         camera = v.camera.to(device)
         counts = torch.ones(SIDE, SIDE, 1, device=device) if v.mask is None else v.mask[..., None].to(device)
         surfels.sh0.grad = None
-        out = nw.render(surfels, None, camera, max_hits=0)
-        (out.plain * counts)[..., 0].sum().backward()
+        (nw.render(surfels, None, camera, max_hits=0).plain * counts)[..., 0].sum().backward()
         shown = ops.plain_colors((surfels.sh0, surfels.shN), surfels.means, camera.position, 3)[:, 0] > 0
         assert surfels.sh0.grad is not None
         weights = torch.where(shown, surfels.sh0.grad[:, 0, 0] / CONSTANT, torch.nan)
@@ -136,8 +134,7 @@ def test_finishing_leaves_the_training_as_it_is(tiny_scene: Scene, device: torch
     assert any(replayed) == (device.type == "cuda")
     model = asked.finish()
     assert model.meta["smooth_sh"] == 0.01 and model.surfels is not asked.surfels
-    assert model.detail_limits is not None
-    assert not torch.equal(model.surfels.shN, asked.surfels.shN)
+    assert model.detail_limits is not None and not torch.equal(model.surfels.shN, asked.surfels.shN)
     kept = {name: x.clone() for name, x in model.surfels.state_dict().items()}
     asked.run()
     other.run()

@@ -88,8 +88,7 @@ def test_extremes_are_finite_and_what_torch_gives(dtype: torch.dtype, device: to
             logits = surfels.logit_opacities.detach()
             torchs = signals(surfels)[2] * logits.sigmoid() * (-logits).sigmoid()
         rtol = 1e-12 if dtype == torch.float64 else 2e-6
-        smallest = torch.finfo(dtype).tiny
-        torch.testing.assert_close(ours, torchs, rtol=rtol, atol=smallest)
+        torch.testing.assert_close(ours, torchs, rtol=rtol, atol=torch.finfo(dtype).tiny)
     name, ours, torchs = grads[0]
     lengths = surfels.raw_quats.detach().norm(dim=-1, keepdim=True).clamp_min(1e-12)
     for row in range(len(surfels)):

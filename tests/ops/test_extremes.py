@@ -111,15 +111,13 @@ def test_awkward_surfels_are_finite(near: float, device: torch.device) -> None:
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
 def test_a_camera_inside_surfels_is_finite(scale: float, near: float, device: torch.device) -> None:
     scene = scene_with(device, scales=scale, near=near)
-    position = make_camera(scene).position.detach()
-    check_finite(scene | {"means": position.expand(24, 3).clone()})
+    check_finite(scene | {"means": make_camera(scene).position.detach().expand(24, 3).clone()})
 
 
 def test_a_surfel_around_the_camera_is_seen_only_beyond_near(device: torch.device) -> None:
     """The camera sits in a sheet, or before it by less than near."""
     for depth, near, seen in ((0.0, 0.01, False), (0.005, 0.01, False), (0.005, 0.0, True), (0.02, 0.01, True)):
-        scene = facing(device, means=(0.0, 0.0, depth), scales=1e3) | {"near": near}
-        out = check_finite(scene)
+        out = check_finite(facing(device, means=(0.0, 0.0, depth), scales=1e3) | {"near": near})
         assert_close(out.alpha, torch.full((16, 16), 0.9 if seen else 0.0), kind="value", name=f"alpha at {depth}")
 
 
@@ -182,11 +180,9 @@ def test_a_large_image() -> None:
 
 @pytest.mark.cuda
 def test_five_million_surfels() -> None:
-    device = torch.device("cuda")
-    scene = random_scene(5_000_000, width=640, height=480, sh_degree=0, device=device)
+    scene = random_scene(5_000_000, width=640, height=480, sh_degree=0, device=torch.device("cuda"))
     scene["scales"] *= 0.05
-    out = check_finite(scene, max_hits=2)
-    assert (out.alpha > 0).float().mean() > 0.5
+    assert (check_finite(scene, max_hits=2).alpha > 0).float().mean() > 0.5
 
 
 # More entries than lists can have
@@ -220,5 +216,4 @@ def test_more_entries_than_int32_counts_never_overrun(count: int, device: torch.
     projection = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat)
     tiles = ops.intersect_tiles(shape, projection, camera.viewmat, pinhole, room=1000)
     assert int(tiles.ends[-1]) == LARGEST_INT > len(tiles.surfel_ids) == 1000  # so the walk goes over all surfels
-    assert len(tiles.entries) == 0
-    assert ((tiles.surfel_ids >= 0) & (tiles.surfel_ids < count)).all()
+    assert len(tiles.entries) == 0 and ((tiles.surfel_ids >= 0) & (tiles.surfel_ids < count)).all()

@@ -86,5 +86,4 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork") or not hasattr(signal, "
 
 
 def test_a_forked_process_renders_as_its_parent():
-    lines = run(PARENT + FORK + MULTIPROCESSING + AFTER).splitlines()
-    assert lines[-3:] == ["child True", "child True", "parent"]
+    assert run(PARENT + FORK + MULTIPROCESSING + AFTER).splitlines()[-3:] == ["child True", "child True", "parent"]

@@ -45,8 +45,7 @@ class Case(NamedTuple):
         for matrix in hidden:
             layer = rounded(torch.relu(layer @ matrix.T))
         coefficients = (layer @ last.T).unflatten(1, (-1, 3))
-        directions = self.rays.directions.double().repeat_interleave(self.hits, 0)[seen]
-        found = sh.evaluate(coefficients, directions, 3)
+        found = sh.evaluate(coefficients, self.rays.directions.double().repeat_interleave(self.hits, 0)[seen], 3)
         colors = 0.1 + torch.zeros_like(positions).index_put((seen.nonzero()[:, 0],), found)
         return colors.clamp_min(0.0) if self.rays.clamp else colors
 
@@ -116,8 +115,7 @@ def test_fused_and_layered_agree(features, degree, clamp, size, counted):
     references = list(torch.autograd.grad(exact, case.leaves, case.signal))
     for fused in (False, True):
         colors = case.texture(fused=fused)
-        gradients = list(torch.autograd.grad(colors, case.leaves, case.signal))
-        assert_agree(colors, gradients, exact, references)
+        assert_agree(colors, list(torch.autograd.grad(colors, case.leaves, case.signal)), exact, references)
     assert len(counted) == 1
     with torch.no_grad():
         assert torch.equal(case.texture(fused=True), colors)
@@ -133,8 +131,7 @@ def test_what_the_fused_kernels_do_not_take_is_computed_in_layers(counted: list[
     with deterministic(True):
         case.texture(fused=True)
     case.rays.directions.requires_grad_()
-    colors = case.texture(fused=True)
-    assert torch.autograd.grad(colors, case.rays.directions, case.signal)[0].abs().max() > 0
+    assert torch.autograd.grad(case.texture(fused=True), case.rays.directions, case.signal)[0].abs().max() > 0
     assert not counted
     with torch.no_grad():
         case.texture(fused=True)

@@ -143,8 +143,7 @@ def test_of_equal_weights_the_nearer_stays_when_a_heavier_one_comes(device: torc
         if weight[0] != weight[1]:
             continue
         found += 1
-        assert out.ids[0, 0, :3].tolist() == [2, 0, 1]
-        assert draw(scene, max_hits=2).ids[0, 0].tolist() == [2, 0]
+        assert out.ids[0, 0, :3].tolist() == [2, 0, 1] and draw(scene, max_hits=2).ids[0, 0].tolist() == [2, 0]
     assert found > 10
 
 
@@ -157,7 +156,6 @@ def test_however_large_a_surfel_is_it_is_seen(scale: float, device: torch.device
 
 @pytest.mark.parametrize("mean", [(1e5, 0.0, 0.05), (0.0, 1e7, 0.02)])
 def test_a_huge_surfel_just_beyond_the_near_plane_is_seen(mean, device):
-    scene = in_a_row(device, [0.9], scale=1e10)
-    out = draw(scene | {"means": torch.tensor([mean], device=device)})
+    out = draw(in_a_row(device, [0.9], scale=1e10) | {"means": torch.tensor([mean], device=device)})
     assert_close(out.alpha, torch.full((1, 1), 0.9), kind="value", name="alpha")
     assert_close(out.depths[..., 0], torch.full((1, 1), mean[2]), kind="value", name="depth")

@@ -57,8 +57,7 @@ def pipeline(
     else:
         hits = nw.rasterize(**geometry, colors=colors, camera=camera, max_hits=max_hits)
     features = colors[hits.ids.clamp_min(0).long()]
-    filled = (hits.ids >= 0)[..., None]
-    texels = torch.where(filled, shade(mlp, features, hits.points, hits.directions), 0.0)
+    texels = torch.where((hits.ids >= 0)[..., None], shade(mlp, features, hits.points, hits.directions), 0.0)
     background = torch.linspace(-1, 1, channels, dtype=dtype, device=device)
     if reference:
         image = hits.plain + (hits.weights[..., None] * texels).sum(-2) + (1 - hits.alpha)[..., None] * background

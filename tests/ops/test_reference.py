@@ -43,8 +43,7 @@ def sheets(
     shape = Shape(
         torch.stack([0 * z, 0 * z, z], dim=-1), quats, scales, opacities, tensor((1.0, 1.5)).expand(count, -1)
     )
-    colors = torch.eye(3, dtype=torch.float64)[torch.arange(count) % 3]
-    return shape, colors, torch.eye(4, dtype=torch.float64)
+    return shape, torch.eye(3, dtype=torch.float64)[torch.arange(count) % 3], torch.eye(4, dtype=torch.float64)
 
 
 # Five by five pixels; the centre of pixel [2, 2] is the principal point, a pixel is 0.2 wide at depth 2.
@@ -112,8 +111,7 @@ def test_two_layers_by_hand() -> None:
 
 def test_nearer_wins_a_tie_of_weights() -> None:
     """0.8 x 0.25 is 0.2 to the last bit."""
-    hits = collect(*sheets((3.0, 0.25), (2.0, 0.2)), VIEW, 1)
-    assert hits.ids[2, 2].tolist() == [1]
+    assert collect(*sheets((3.0, 0.25), (2.0, 0.2)), VIEW, 1).ids[2, 2].tolist() == [1]
     assert collect(*sheets((3.0, 0.25), (2.0, 0.2)), VIEW, 2).ids[2, 2].tolist() == [1, 0]
 
 
@@ -155,8 +153,7 @@ def test_encode_at_a_corner_and_between() -> None:
     """At a corner the entry, between two corners their mean; times 1 - exp(-1 / 2 pi) where f = s t."""
     grid = torch.randn(2, 16, 3, dtype=torch.float64)
     resolutions = tensor(2.0, 4.0)
-    positions = tensor((1.5, -1.0, 0.0), (1.75, -1.0, 0.0))
-    features = encode(positions, tensor(5.0, 5.0), grid, resolutions, focal=10.0)
+    features = encode(tensor((1.5, -1.0, 0.0), (1.75, -1.0, 0.0)), tensor(5.0, 5.0), grid, resolutions, focal=10.0)
     entries = hash_corners(torch.tensor([[3, -2, 0], [4, -2, 0], [6, -4, 0], [7, -4, 0]]), 16).tolist()
     factors = 1 - math.exp(-1 / (2 * math.pi)), 1 - math.exp(-0.25 / (2 * math.pi))
     expected = torch.stack([
@@ -190,8 +187,7 @@ def test_the_field_is_asked_where_the_pixel_sees_the_surfel() -> None:
     out = render(shape, torch.zeros(1, 1, 3, dtype=torch.float64), texture, viewmat, VIEW, max_hits=1)
     factor = 1 - math.exp(-((10 / (0.25 * 2.0)) ** 2) / (2 * math.pi))
     # Pixel [3, 2] sees the surfel 0.2 below the axis, at (0.5, 0.7, 3) in the world.
-    coefficients = factor * tensor(0.5, 0.7, 3.0) / 4
-    expected = (0.5 + 0.28209479177387814 * coefficients) * out.weights[3, 2, 0]
+    expected = (0.5 + 0.28209479177387814 * (factor * tensor(0.5, 0.7, 3.0) / 4)) * out.weights[3, 2, 0]
     assert_close(out.textured[3, 2], expected, kind="value", name="textured")
 
 
@@ -210,5 +206,4 @@ def test_gradients_of_the_whole_render(sh_degree: int, textured: bool) -> None:
         out = render(shape, tensors[5], texture, tensors[6], view_of(scene), background=background)
         return out.image, out.plain, out.textured, out.depths, out.weights, out.alpha
 
-    assert picture(*inputs)[5].max() > 0.3
-    assert torch.autograd.gradcheck(picture, inputs, fast_mode=True)
+    assert picture(*inputs)[5].max() > 0.3 and torch.autograd.gradcheck(picture, inputs, fast_mode=True)

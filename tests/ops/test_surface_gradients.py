@@ -63,8 +63,7 @@ def test_gradients_of_the_reference_agree_with_differences() -> None:
         out = reference(dict(zip((*GEOMETRY, "viewmat"), tensors, strict=True)), camera)
         return tuple(getattr(out, name) for name in BUFFERS)
 
-    assert buffers(*inputs)[-1].max() > 0.01
-    assert torch.autograd.gradcheck(buffers, inputs, fast_mode=True)
+    assert buffers(*inputs)[-1].max() > 0.01 and torch.autograd.gradcheck(buffers, inputs, fast_mode=True)
 
 
 def test_a_rendering_walks_once_until_a_surface_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,8 +79,7 @@ def test_a_rendering_walks_once_until_a_surface_is_asked_for(monkeypatch: pytest
     for name in kernels:
         monkeypatch.setattr(module, name, functools.partial(noted, name))
     scene = random_scene()
-    surfels = make_surfels(scene)
-    out = nw.render(surfels, make_texture(), make_camera(scene))
+    out = nw.render(make_surfels(scene), make_texture(), make_camera(scene))
     out.image.sum().backward(retain_graph=True)
     assert not launched
     (out.normals.sum() + out.expected_depth.sum()).backward()

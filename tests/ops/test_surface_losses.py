@@ -30,14 +30,12 @@ def plane_depths(normal: torch.Tensor, device: torch.device) -> torch.Tensor:
     (fx, fy), (cx, cy), (width, height) = PINHOLE
     places = (torch.arange(n, dtype=torch.float64, device=device) + 0.5 for n in (height, width))
     y, x = torch.meshgrid(*places, indexing="ij")
-    rays = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], -1)
-    return -2.0 / (rays @ normal)
+    return -2.0 / (torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], -1) @ normal)
 
 
 def test_a_plane_has_its_normal(device: torch.device) -> None:
     """Seen from a turned camera, in the world's frame, on the side that faces the camera; the border has none."""
-    scene = random_scene(dtype=torch.float64, device=device)
-    viewmat = scene["viewmat"]
+    viewmat = random_scene(dtype=torch.float64, device=device)["viewmat"]
     normal = torch.nn.functional.normalize(torch.tensor([0.3, -0.2, -0.9], dtype=torch.float64, device=device), dim=0)
     found = depth_normals(plane_depths(normal, device), viewmat, pinhole(device))
     expected = torch.zeros_like(found)
@@ -53,8 +51,7 @@ def test_beside_a_pixel_without_a_surface_there_is_no_normal(device: torch.devic
     depths = torch.full(PINHOLE[2][::-1], 2.0, dtype=torch.float64, device=device)
     depths[6, 9] = 0.0
     known = depth_normals(depths, torch.eye(4).to(depths), pinhole(device)).any(-1)
-    missing = (~known[1:-1, 1:-1]).nonzero() + 1
-    assert sorted(missing.tolist()) == [[5, 9], [6, 8], [6, 10], [7, 9]]
+    assert sorted(((~known[1:-1, 1:-1]).nonzero() + 1).tolist()) == [[5, 9], [6, 8], [6, 10], [7, 9]]
 
 
 def test_depth_normals_against_differences(device: torch.device) -> None:

@@ -35,8 +35,7 @@ def test_lists_are_near_to_far_and_cover_every_hit(device: torch.device) -> None
     side = tile_size_on(device.type == "cuda")
     for tile, (start, end) in enumerate(itertools.pairwise(offsets)):
         listed = tiles.surfel_ids[start:end].long()
-        assert (depths[listed, 2].diff() >= -1e-5).all()
-        assert len(listed.unique()) == len(listed)
+        assert (depths[listed, 2].diff() >= -1e-5).all() and len(listed.unique()) == len(listed)
         row, column = divmod(tile, tiles.columns)
         seen = hits.ids[row * side : (row + 1) * side, column * side : (column + 1) * side].unique()
         assert set(seen[seen >= 0].tolist()) <= set(listed.tolist())

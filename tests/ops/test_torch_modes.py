@@ -150,8 +150,7 @@ def test_compiled_code_calls_a_rendering_as_it_is(name, device):
     expected = draws[name](means)
     value = torch.compile(draws[name], backend="aot_eager")(means)  # warnings are errors
     assert_close(value, expected, kind="value", name=name)
-    grads = [torch.autograd.grad(x, means)[0] for x in (value, expected)]
-    assert_close(*grads, kind="gradient", name=name)
+    assert_close(*[torch.autograd.grad(x, means)[0] for x in (value, expected)], kind="gradient", name=name)
     with pytest.raises(Exception, match=r"intentionally marked|torch\.compiler\.disable"):  # of torch 2.15
         torch.compile(draws[name], backend="eager", fullgraph=True)(means)
 

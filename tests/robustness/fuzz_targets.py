@@ -169,8 +169,7 @@ def _trainer() -> Trainer:
     """Return a trainer after two steps."""
     with tempfile.TemporaryDirectory() as folder:
         scene = load_scene(_scene(Path(folder) / "scene"))
-    config = Config(iterations=4, max_surfels=20, sh_degree=1, texture=TEXTURE)
-    trainer = Trainer(scene, config, "cpu")
+    trainer = Trainer(scene, Config(iterations=4, max_surfels=20, sh_degree=1, texture=TEXTURE), "cpu")
     trainer.run(until=2)
     return trainer
 
@@ -310,8 +309,7 @@ def _read_baked(folder: Path) -> None:
 
 
 def _exr(folder: Path) -> list[Files]:
-    rng = np.random.default_rng(0)
-    color = torch.from_numpy(rng.random((HEIGHT, WIDTH, 3), np.float32))
+    color = torch.from_numpy(np.random.default_rng(0).random((HEIGHT, WIDTH, 3), np.float32))
     save_exr(folder / "a" / "a.exr", {"image": color, "ids": color[..., 0].int(), "depth": color[..., 1].contiguous()})
     save_exr(folder / "b" / "a.exr", {"depth": torch.ones(HEIGHT, WIDTH)}, {"near": 0.01})
     return [_files(folder / "a"), _files(folder / "b")]

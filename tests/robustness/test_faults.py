@@ -128,8 +128,7 @@ def test_a_full_disk_still_gets_the_model_when_it_has_room_for_that(scene, tmp_p
     words = ("No space left", "training stops at iteration 2", "the current model is saved", "--resume")
     with failing(Disk(run, second, FULL)):
         refused(capsys, command, *words)
-    assert nw.load(run).meta["iteration"] == 2
-    assert whole_checkpoints(run) == [1]
+    assert nw.load(run).meta["iteration"] == 2 and whole_checkpoints(run) == [1]
 
 
 @pytest.mark.parametrize(

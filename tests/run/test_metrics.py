@@ -56,8 +56,7 @@ def test_ssim_map_is_scikit_images_away_from_the_border(device: torch.device) ->
 
 def test_psnr_by_hand() -> None:
     black, white = torch.zeros(4, 6, 3), torch.ones(4, 6, 3)
-    assert metrics.psnr(black, white) == 0.0
-    assert metrics.psnr(black, black) == math.inf
+    assert metrics.psnr(black, white) == 0.0 and metrics.psnr(black, black) == math.inf
     assert metrics.psnr(black, torch.full((4, 6, 3), 51, dtype=torch.uint8)) == pytest.approx(20 * math.log10(5))
     one = torch.zeros(4, 6, 3, dtype=torch.uint8)
     one[1, 2, 0] = 255
@@ -79,8 +78,7 @@ def test_to_uint8_rounds_and_clamps() -> None:
     values = torch.tensor([-1.0, 0.0, 0.49 / 255, 0.51 / 255, 254.6 / 255, 1.0, 7.0])
     assert to_uint8(values).tolist() == [0, 0, 0, 1, 255, 255, 255]
     every = torch.arange(256, dtype=torch.uint8)
-    assert to_uint8(every.float() / 255).equal(every)
-    assert to_uint8(every) is every
+    assert to_uint8(every.float() / 255).equal(every) and to_uint8(every) is every
     with pytest.raises(ValueError, match="image: expected finite values, got nan at index"):
         to_uint8(torch.tensor([0.0, float("nan")]))
     with pytest.raises(TypeError, match=r"image: expected uint8 or a floating dtype, got torch\.int64"):

@@ -30,8 +30,7 @@ def test_a_saved_model_opens_everywhere(name, model, tiny_folder, tmp_path, caps
     model.save(saved)
     results = tmp_path / "scene" if saved.suffix else saved
     assert cli.main(["info", str(saved)]) == 0
-    assert "30" in capsys.readouterr().out
-    assert cli.main(["render", str(saved), "--frames", "3", *SIZE]) == 0
+    assert "30" in capsys.readouterr().out and cli.main(["render", str(saved), "--frames", "3", *SIZE]) == 0
     assert [f.name for f in sorted((results / "renders" / "ellipse").iterdir())] == ["0000.png", "0001.png", "0002.png"]
     assert cli.main(["export", str(saved)]) == 0
     assert {f.name for f in (results / "export").iterdir()} == {"surfels.ply", "splats.ply"}

@@ -42,8 +42,7 @@ def test_photos_without_a_map_have_the_same_kind_of_step(mapped: Scene) -> None:
     """So that one CUDA graph serves all, those with a teacher's picture too: zeros, which count nowhere."""
     trainer = Trainer(mapped, small(losses=LossWeights(depth=0.0)), "cpu")
     bare, full = (trainer.targets.make(index, 1, []) for index in (0, 1))
-    assert _kind(bare) == _kind(full)
-    assert not present(bare.depth).any() and bool((present(full.depth) == 3).all())
+    assert _kind(bare) == _kind(full) and not present(bare.depth).any() and bool((present(full.depth) == 3).all())
     teacher = trained(mapped, small(seed=1)).finish()
     student = Trainer(mapped, small(losses=LossWeights(depth=0.0)), "cpu", teachers=[teacher])
     taught = student.targets.make(1, 2, [])
@@ -55,8 +54,7 @@ def test_masked_pixels_have_no_depth(mapped: Scene, mode: str) -> None:
     view = mapped.train[1]
     mask = torch.rand(view.image.shape[:2]) < 0.5
     scene = dataclasses.replace(mapped, train=[dataclasses.replace(view, mask=mask), *mapped.train[2:]])
-    trainer = Trainer(scene, small(mask_mode=mode), "cpu")
-    depth = trainer.targets.make(0, 1, []).depth
+    depth = Trainer(scene, small(mask_mode=mode), "cpu").targets.make(0, 1, []).depth
     assert torch.equal(present(depth), 3.0 * mask)
 
 
@@ -93,8 +91,7 @@ def test_a_wrong_scale_gives_the_same_targets(tiny_folder: Path, tmp_path: Path)
 
 
 def test_a_run_with_maps_resumes_and_other_maps_are_another_scene(mapped: Scene, tmp_path: Path) -> None:
-    straight = trained(mapped, small())
-    assert_resumed_alike(straight, tmp_path)
+    assert_resumed_alike(trained(mapped, small()), tmp_path)
     other = dataclasses.replace(mapped, train=[mapped.train[0], *(at(view, 4.0) for view in mapped.train[1:])])
     with pytest.raises(nw.errors.CheckpointError, match="photos, masks, depth maps or points have changed"):
         Trainer(other, small(), "cpu").restore(tmp_path)

@@ -108,8 +108,7 @@ def test_teachers_too(tiny_scene: Scene) -> None:
     """Steps with a teacher's picture have the graph of steps with photos."""
     teachers, runs = [trained(tiny_scene, seed=seed).finish() for seed in (1, 2)], []
     for graphs in (False, True):
-        config = Config(**(SETTINGS | {"cuda_graphs": graphs}))
-        runs.append(Trainer(tiny_scene, config, "cuda", teachers=teachers))
+        runs.append(Trainer(tiny_scene, Config(**(SETTINGS | {"cuda_graphs": graphs})), "cuda", teachers=teachers))
         runs[-1].run()
     launched, replayed = runs
     assert graphs_of(replayed) == 1

@@ -37,11 +37,9 @@ def test_the_table_is_as_large_as_the_photos_can_fill(scene, pixels, power):
     """A tenth of a number for each pixel, 8 levels of 4 numbers an entry, and at most the paper's size."""
     each = pixels // len(scene.train)
     camera = Camera(torch.eye(4), torch.eye(3), 1000, each // 1000) if each >= 1000 else scene.train[0].camera
-    views = [dataclasses.replace(view, camera=camera) for view in scene.train]
-    sized = dataclasses.replace(scene, train=views)
+    sized = dataclasses.replace(scene, train=[dataclasses.replace(view, camera=camera) for view in scene.train])
     shape = texture_shape(sized, small(texture=TextureConfig(max_resolution=64.0)))
-    assert shape["table_size"] == 2**power
-    assert texture_shape(sized, small())["table_size"] == TEXTURE.table_size
+    assert shape["table_size"] == 2**power and texture_shape(sized, small())["table_size"] == TEXTURE.table_size
 
 
 @pytest.mark.parametrize("case", ["random", "aligned", "opposite", "square"])
@@ -53,8 +51,7 @@ def test_surfels_turn_to_their_normals_by_the_least_angle(case):
     turned = quats_towards(normals, quats)
     torch.testing.assert_close(turned.norm(dim=-1), torch.ones(len(turned)), rtol=0, atol=1e-5)
     z = rotations(turned)[:, :, 2]
-    cosines = (z * normals).sum(-1)
-    torch.testing.assert_close(cosines.abs(), torch.ones(len(z)), rtol=0, atol=1e-5)
+    torch.testing.assert_close((z * normals).sum(-1).abs(), torch.ones(len(z)), rtol=0, atol=1e-5)
     # The rotation between both has the angle that the axis had from the nearer of +-normal.
     unit = torch.nn.functional.normalize(quats, dim=-1).double()
     half = (unit * turned.double()).sum(-1).abs()
@@ -72,16 +69,14 @@ def test_initial_surfels(scene, budget, orient):
         scene.points, scene.colors, budget // 2, track_lengths=scene.track_lengths, errors=scene.reprojection_errors
     )
     count = len(surfels)
-    assert count == len(points.means) and count <= budget // 2
-    assert torch.equal(surfels.means, points.means)
+    assert count == len(points.means) and count <= budget // 2 and torch.equal(surfels.means, points.means)
     full = torch.full
     torch.testing.assert_close(surfels.opacities, full((count,), 0.1))
     torch.testing.assert_close(surfels.gammas, full((count, 2), 1 + math.exp(-5)))
     torch.testing.assert_close(surfels.scales, points.scales[:, None].expand(-1, 2))
     torch.testing.assert_close(0.5 + 0.28209479177387814 * surfels.sh[:, 0], points.colors)
     assert not surfels.sh[:, 1:].any() and surfels.sh.shape == (count, 16, 3)
-    facing = (rotations(surfels.quats)[:, :, 2] * points.normals).sum(-1).abs()
-    assert bool((facing > 1 - 1e-4).all()) == orient
+    assert bool(((rotations(surfels.quats)[:, :, 2] * points.normals).sum(-1).abs() > 1 - 1e-4).all()) == orient
 
 
 def test_paper_takes_all_points(scene):

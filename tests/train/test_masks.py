@@ -24,8 +24,7 @@ def test_background_is_the_given_one_the_scenes_or_the_mean(scene: Scene) -> Non
     photos = torch.stack([view.image for view in scene.train]).double() / 255
     assert mean_color(scene.train) == pytest.approx(photos.mean((0, 1, 2)).tolist(), abs=1e-9)
     assert make_trainer(scene).render_options().background == mean_color(scene.train)
-    black = make_trainer(scene, background=(0.0, 0.0, 0.0))
-    assert black.render_options().background == (0.0, 0.0, 0.0)
+    assert make_trainer(scene, background=(0.0, 0.0, 0.0)).render_options().background == (0.0, 0.0, 0.0)
     white = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))
     assert make_trainer(white).render_options().background == (1.0, 1.0, 1.0)
 
@@ -50,8 +49,7 @@ def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) ->
 def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
     mask = torch.zeros(36, 48, dtype=torch.bool)
     mask[:, :24] = True
-    views = [dataclasses.replace(view, mask=mask) for view in scene.train]
-    halves = dataclasses.replace(scene, train=views)
+    halves = dataclasses.replace(scene, train=[dataclasses.replace(view, mask=mask) for view in scene.train])
     alphas = {}
     for mode in ("ignore", "background"):
         trainer = make_trainer(halves, iterations=60, mask_mode=mode)
@@ -75,8 +73,7 @@ def test_masks_take_part_in_the_judgement(scene: Scene) -> None:
     model = trainer.model()
 
     def judge(*views: View, mode: str = "ignore") -> Evaluation:
-        metrics = ("psnr", "ssim", "flip")
-        return evaluate(model, views, mask_mode=mode, metrics=metrics)
+        return evaluate(model, views, mask_mode=mode, metrics=("psnr", "ssim", "flip"))
 
     one, other = judge(view), judge(spoilt)
     assert one["psnr"] == other["psnr"]

@@ -65,12 +65,10 @@ def test_an_incomplete_last_step_is_the_mean_of_its_views(scene: Scene, tmp_path
         trainer = ParallelTrainer(scene, small(iterations=5), CPU, ranks)
         shares = []
         while trainer.iteration < 5:
-            views = trainer.step().views
-            shares.append((views, trainer.share))
+            shares.append((trainer.step().views, trainer.share))
         return shares
 
-    rendered = run_ranks(3, work, tmp_path)
-    assert rendered == [[[3, 1 / 3], [2, 1 / 2]]] * 2 + [[[3, 1 / 3], [2, 0.0]]]
+    assert run_ranks(3, work, tmp_path) == [[[3, 1 / 3], [2, 1 / 2]]] * 2 + [[[3, 1 / 3], [2, 0.0]]]
 
 
 @pytest.mark.parametrize(
@@ -233,12 +231,10 @@ def test_a_killed_rank_ends_all_and_the_run_resumes(tiny_folder: Path, tmp_path:
     assert processes[1].pid is not None
     os.kill(processes[1].pid, signal.SIGKILL)
     killed = time.monotonic()
-    assert wait(processes) == [3, -signal.SIGKILL]
-    assert time.monotonic() - killed < 10
+    assert wait(processes) == [3, -signal.SIGKILL] and time.monotonic() - killed < 10
     (line,) = printed(tmp_path / "b")
     expected = "rank 0: the connection to another rank is lost; --resume continues from the last checkpoint"
-    assert line == f"nexwarp: error: {expected}"
-    assert not (run / MODEL_FILE).exists()
+    assert line == f"nexwarp: error: {expected}" and not (run / MODEL_FILE).exists()
     resumed = start_ranks(2, lambda _: cli.main(train(run, "--device", "cpu", "--resume")), tmp_path / "c")
     assert wait(resumed) == [0, 0] and printed(tmp_path / "c") == []
     assert (run / MODEL_FILE).read_bytes() == (whole / MODEL_FILE).read_bytes()
@@ -275,5 +271,4 @@ def test_many_gradients_are_summed_after_the_graph() -> None:
         config = Config(max_surfels=count)
         assert sums_beside("nccl", surfels, texture, config) is beside
         assert sums_beside("gloo", surfels, texture, config)
-    untextured = Config(max_surfels=most + 1, max_hits=0)
-    assert not sums_beside("nccl", surfels, texture, untextured)
+    assert not sums_beside("nccl", surfels, texture, Config(max_surfels=most + 1, max_hits=0))

@@ -142,8 +142,7 @@ def shown(model: nw.Model) -> Scene:
 
 def test_disturbed_poses_come_back_in_training(shown, model):
     """With surfels that are right, the training poses return to the true ones, up to the gauge."""
-    rates = LearningRates(**STILL)
-    config = small(iterations=240, max_hits=0, refine_poses=True, exposures=False, rates=rates)
+    config = small(iterations=240, max_hits=0, refine_poses=True, exposures=False, rates=LearningRates(**STILL))
     config = dataclasses.replace(config, densify=DensifyConfig(stop=0), sh_every=1)
     config = dataclasses.replace(config, background=(0.0, 0.0, 0.0))
     # Surfels that stand still hold the gauge at the true one: so no pose is off by what all are off by.
@@ -167,8 +166,7 @@ def test_fitted_test_poses_come_back_and_the_model_stays(shown, model):
     fitted, facts = fit_poses(model, wrong)
     true = poses_of([view.camera for view in shown.test])
     angles = [pose_differences(poses_of([v.camera for v in views]), true)[0].mean() for views in (wrong, fitted)]
-    assert angles[1] < 0.2 * angles[0]
-    assert evaluate(model, fitted)["psnr"] > evaluate(model, wrong)["psnr"] + 6
+    assert angles[1] < 0.2 * angles[0] and evaluate(model, fitted)["psnr"] > evaluate(model, wrong)["psnr"] + 6
     assert 0.3 < facts["mean_rotation_degrees"] < 0.7 and facts["steps"] == 80
     assert all(torch.equal(x, before[name]) for name, x in model.state_dict().items())
     assert all(parameter.requires_grad for parameter in model.parameters())

@@ -106,8 +106,7 @@ def test_settings_of_an_older_version_are_completed_from_their_preset(name: str)
     assert config_from_dict({"preset": name}) == preset(name)
     older = {key: value for key, value in full.items() if key != "smooth_sh"}
     older["texture"] = {"levels": 5, "table_size": 2**8}
-    found = config_from_dict(older)
-    assert found == with_settings(preset(name), {"texture.levels": 5, "texture.table_size": 2**8})
+    assert config_from_dict(older) == with_settings(preset(name), {"texture.levels": 5, "texture.table_size": 2**8})
     assert config_from_dict({"preset": "of mine", "seed": 3}) == dataclasses.replace(Config(), preset="of mine", seed=3)
 
 

@@ -79,8 +79,7 @@ def test_a_fast_run_has_the_iterations_that_its_photos_need(preset, changes, pho
     ],
 )
 def test_a_run_has_teachers_where_photos_are_few(changes: dict[str, Any], photos: int, count: int) -> None:
-    config = dataclasses.replace(Config(), **changes)
-    assert plan_teachers(config, photos).count == count
+    assert plan_teachers(dataclasses.replace(Config(), **changes), photos).count == count
 
 
 @pytest.mark.parametrize("iterations", [7, 30, 12_345, 30_000])
@@ -93,8 +92,7 @@ def test_teachers_have_two_fifths_of_the_iterations(iterations: int, count: int)
         return
     *before, student = settings_of(config, plan_teachers(config, 20))
     lengths = [each.iterations for each in before]
-    assert len(set(lengths)) == 1 and min(lengths) >= 1
-    assert sum(lengths) + student.iterations == iterations
+    assert len(set(lengths)) == 1 and min(lengths) >= 1 and sum(lengths) + student.iterations == iterations
     assert abs(sum(lengths) - 0.4 * iterations) < count or lengths[0] == 1
     assert len({each.seed for each in (*before, student)}) == count + 1 and student.seed == 5
     for each in (*before, student):
@@ -198,8 +196,7 @@ def test_a_teacher_is_a_run(run: Path) -> None:
         seeds, spent = seeds | {config.seed}, spent + facts["seconds"]
         assert cli.main(["eval", str(folder), "--device", "cpu"]) == 0
         assert "psnr" in json.loads((folder / "metrics.json").read_text())
-    assert len(seeds) == 3 and metrics["seconds"] > spent
-    assert not list_files(run)[1]
+    assert len(seeds) == 3 and metrics["seconds"] > spent and not list_files(run)[1]
 
 
 @pytest.mark.parametrize("lost", ["student", "teacher 2", "all"])

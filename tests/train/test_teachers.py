@@ -151,8 +151,7 @@ def test_the_command_learns_from_runs(tiny_folder, tmp_path, monkeypatch, capsys
     for run, seed in (("a", "1"), ("b", "2")):
         assert train(run, "--seed", seed) == 0
     both = ["--teacher", "a", "--teacher", "b"]
-    assert train("c", *both) == 0
-    assert json.loads(Path("c/metrics.json").read_text())["teachers"] == 2
+    assert train("c", *both) == 0 and json.loads(Path("c/metrics.json").read_text())["teachers"] == 2
     assert json.loads(Path("c/config.json").read_text())["teachers"] == [str(tmp_path / "a"), str(tmp_path / "b")]
     assert not any("teachers" in json.loads(Path(f"a/{name}.json").read_text()) for name in ("metrics", "config"))
     # A run resumes with its teachers, before its first checkpoint too.
@@ -160,8 +159,7 @@ def test_the_command_learns_from_runs(tiny_folder, tmp_path, monkeypatch, capsys
     for name in CHECKPOINTS:
         shutil.rmtree(Path("c", name), ignore_errors=True)
     Path("c/model.safetensors").unlink()
-    assert train("c", "--resume") == 0
-    assert Path("c/model.safetensors").read_bytes() == model
+    assert train("c", "--resume") == 0 and Path("c/model.safetensors").read_bytes() == model
     shutil.move("b", "moved")
     assert train("c", "--resume", "--teacher", "a", "--teacher", "moved") == 0
     assert train("c", "--resume") == 0  # it has noted where they lie
@@ -172,8 +170,7 @@ def test_the_command_learns_from_runs(tiny_folder, tmp_path, monkeypatch, capsys
         ([*both, "--refine-poses"], "--teacher: expected poses that stay as given"),
         (["--teacher", "d/model.safetensors"], "--teacher: expected another run than d"),
     ):
-        assert train("d", *options) == 2
-        assert message in " ".join(capsys.readouterr().err.split())
+        assert train("d", *options) == 2 and message in " ".join(capsys.readouterr().err.split())
         assert not Path("d").exists()
     assert train("a", "--overwrite", "--teacher", "a") == 2
     assert "--teacher: expected another run than a" in " ".join(capsys.readouterr().err.split())

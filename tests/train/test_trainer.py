@@ -78,8 +78,7 @@ def test_it_learns(scene):
     before, losses = mean_psnr(trainer, scene.train), []
     trainer.run(lambda progress: losses.append(progress.loss()))
     epoch = len(scene.train)
-    assert all(math.isfinite(loss) for loss in losses)
-    assert sum(losses[-epoch:]) < 0.8 * sum(losses[:epoch])
+    assert all(math.isfinite(loss) for loss in losses) and sum(losses[-epoch:]) < 0.8 * sum(losses[:epoch])
     after = mean_psnr(trainer, scene.train)
     assert after >= before + 2.0, f"{before:.2f} -> {after:.2f} dB"
 
@@ -88,8 +87,7 @@ def test_progress_tells_what_happened(scene):
     trainer = Trainer(scene, small(), "cpu")
     seen: list[nw.StepReport] = []
     trainer.run(seen.append)
-    assert [p.iteration for p in seen] == list(range(1, 13))
-    assert seen[-1].surfels == len(trainer.surfels)
+    assert [p.iteration for p in seen] == list(range(1, 13)) and seen[-1].surfels == len(trainer.surfels)
     for p in seen:
         assert p.loss() == pytest.approx(sum(x.item() for x in p.losses.values()), rel=1e-6)
         error = (p.image.detach().double().clamp(0, 1) - p.target.double()).square().mean().item()
@@ -98,8 +96,7 @@ def test_progress_tells_what_happened(scene):
         assert set(p.losses) == {"l1", "dssim", "texture", "alpha", "opacity", "grid", "depth"}
     counts = [p.surfels for p in seen]
     assert all(later == before for i, (before, later) in enumerate(itertools.pairwise(counts)) if i % 3 != 1)
-    assert counts[2] == 63 == int(1.05 * counts[0])
-    assert max(counts) <= 120
+    assert counts[2] == 63 == int(1.05 * counts[0]) and max(counts) <= 120
 
 
 def test_rates_are_log_linear_between_their_ends(scene):
@@ -111,8 +108,7 @@ def test_rates_are_log_linear_between_their_ends(scene):
     constant = [r.quats, r.scales, r.opacities, r.gammas, r.sh0, r.shN]
     assert rates[0] == pytest.approx([1.6e-4 * s, *constant, 1e-3, 1e-3], rel=1e-12)
     assert rates[-1] == pytest.approx([1.6e-6 * s, *constant, 1e-5, 1e-5], rel=1e-12)
-    logs = torch.tensor(rates, dtype=torch.float64).log()
-    assert logs.diff(n=2, dim=0).abs().max() < 1e-9
+    assert torch.tensor(rates, dtype=torch.float64).log().diff(n=2, dim=0).abs().max() < 1e-9
     for step, row in enumerate(rates):
         assert row[0] == pytest.approx(1.6e-4 * s * 100 ** (-step / 8), rel=1e-9)
 
@@ -151,13 +147,11 @@ def test_surfels_settle_with_two_hits(scene):
             trainer.step()
         if iteration < 10:
             assert_same_state(four, two)
-        now = [t.render_options().max_hits for t in (two, four, early)]
-        assert now == [2, 2 if iteration < 10 else 4, 4]
+        assert [t.render_options().max_hits for t in (two, four, early)] == [2, 2 if iteration < 10 else 4, 4]
     assert not torch.equal(neural(four.texture).grid, neural(two.texture).grid)
     assert four.finish().options.max_hits == 4
     for hits in (0, 1):
-        few = Trainer(scene, small(iterations=12, max_hits=hits), "cpu")
-        assert few.render_options().max_hits == hits
+        assert Trainer(scene, small(iterations=12, max_hits=hits), "cpu").render_options().max_hits == hits
 
 
 @pytest.mark.parametrize("factor", [64.0, 1 / 64])

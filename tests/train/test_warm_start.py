@@ -52,8 +52,7 @@ def test_gaussians_lie_along_their_two_largest_axes(tmp_path: Path) -> None:
     found = plane @ torch.diag_embed(surfels.scales.detach().double().square()) @ plane.mT
     assert_close(found.float(), expected.float(), kind="value", name="surfels")
     assert torch.equal(surfels.logit_opacities, torch.arange(12) + 30.0)
-    assert surfels.shN[3].tolist() == [[0, 3, 6], [1, 4, 7], [2, 5, 8]]
-    assert bool((surfels.gammas < 1.01).all())
+    assert surfels.shN[3].tolist() == [[0, 3, 6], [1, 4, 7], [2, 5, 8]] and bool((surfels.gammas < 1.01).all())
 
 
 @pytest.mark.parametrize(
@@ -79,10 +78,8 @@ def test_a_training_starts_from_what_is_given(tiny_scene: Scene) -> None:
     from_model = nw.Trainer(tiny_scene, config, "cpu", init=first)
     assert all(torch.equal(getattr(from_model.surfels, name), getattr(first.surfels, name)) for name in PARAMETERS)
     assert isinstance(from_model.texture, nw.NeuralTexture)
-    assert torch.equal(from_model.texture.grid, first.texture.grid)
-    assert from_model.texture is not first.texture
-    plain = dataclasses.replace(config, sh_degree=1)
-    from_surfels = nw.Trainer(tiny_scene, plain, "cpu", surfels=first.surfels)
+    assert torch.equal(from_model.texture.grid, first.texture.grid) and from_model.texture is not first.texture
+    from_surfels = nw.Trainer(tiny_scene, dataclasses.replace(config, sh_degree=1), "cpu", surfels=first.surfels)
     assert torch.equal(from_surfels.surfels.sh, first.surfels.sh[:, :4])
     back = nw.Trainer(tiny_scene, config, "cpu", surfels=from_surfels.surfels).surfels
     assert torch.equal(back.sh[:, :4], first.surfels.sh[:, :4]) and not back.sh[:, 4:].any()

@@ -88,8 +88,7 @@ def test_a_path_is_played_and_kept_as_its_views_say(model, tmp_path, monkeypatch
         editor.keep()
         assert "not saved" in editor.note.content
         for name in [*session.cameras, "train/0.png"]:
-            view = Viewpoint.of_camera(session.cameras[name])
-            session.viewpoint = view
+            session.viewpoint = Viewpoint.of_camera(session.cameras[name])
             editor.add()
         editor._set_views(editor.views[:-1])
         assert len(editor.views) == 2
@@ -161,5 +160,4 @@ def test_the_first_view_has_the_other_cameras_behind_it() -> None:
 def test_frustums_of_neighbours_stay_apart(spacing: float) -> None:
     places = spacing * np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0), [0.0]), axis=-1).reshape(-1, 3)
     assert frustum_size(places) == pytest.approx(min(0.4 * spacing, LARGEST_FRUSTUM))
-    assert frustum_size(np.zeros((9, 3))) == SMALLEST_FRUSTUM
-    assert frustum_size(np.zeros((1, 3))) == LARGEST_FRUSTUM
+    assert frustum_size(np.zeros((9, 3))) == SMALLEST_FRUSTUM and frustum_size(np.zeros((1, 3))) == LARGEST_FRUSTUM

@@ -55,8 +55,7 @@ def test_buffer_modes_tell_what_the_buffers_hold(model, camera):
     there = (out.ids[..., 1] >= 0).numpy()
     assert 0.1 < there.mean() < 0.99
     for mode in BY_SLOT:
-        lit = pictures[mode].pixels.any(axis=2)
-        np.testing.assert_array_equal(lit, there, err_msg=mode)
+        np.testing.assert_array_equal(pictures[mode].pixels.any(axis=2), there, err_msg=mode)
     ids = out.ids[..., 1].numpy()[there]
     colours = {i: {tuple(c) for c in pictures["ids"].pixels[there][ids == i]} for i in np.unique(ids)}
     assert all(len(c) == 1 for c in colours.values()), "one surfel, one colour"

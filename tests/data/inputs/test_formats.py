@@ -46,8 +46,7 @@ def test_points_beside_a_blender_scene(demo, tmp_path):
 
 def test_blender_alone_has_an_angle_and_a_centred_square_camera(tmp_path):
     path = make_scene(tmp_path / "colmap", params=(40.0, 40.0, 24.0, 18.0))
-    scene = load_scene(write_blender(path, tmp_path / "blender", centred=True))
-    assert_same_cameras(scene, load_scene(path))
+    assert_same_cameras(load_scene(write_blender(path, tmp_path / "blender", centred=True)), load_scene(path))
 
 
 @pytest.mark.parametrize("scale", [None, 0.25])

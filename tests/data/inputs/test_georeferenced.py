@@ -71,8 +71,7 @@ def test_a_frame_of_its_own_is_announced(tmp_path):
 @pytest.mark.filterwarnings(ANNOUNCED)
 @pytest.mark.parametrize("write", [colmap, world_transforms, applied(SHIFTED), applied(TURNED)])
 def test_photos_and_points_keep_their_pixels(tmp_path, write):
-    names = room.write_photos(tmp_path / "images")
-    scene = load_scene(write(tmp_path, names))
+    scene = load_scene(write(tmp_path, room.write_photos(tmp_path / "images")))
     assert scene.origin.dtype == torch.float64 and (scene.origin.numpy() != 0).all()
     assert all(view.camera.origin == tuple(scene.origin.tolist()) for view in views_of(scene))
     assert room.color_error(scene, scene.origin.numpy() - UTM) < room.RIGHT

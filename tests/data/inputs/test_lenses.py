@@ -100,8 +100,7 @@ def test_a_wide_fisheye_keeps_its_view(tmp_path, degrees):
 def test_a_lens_that_turns_back_is_masked_from_there(tmp_path):
     """r - 0.5 r^3 turns back at r = 0.82: what lies beyond would show the inner part again."""
     lens = Lens("OPENCV", (40.0, 40.0, *CENTRE, -0.5, 0.0, 0.0, 0.0), room.WIDTH, room.HEIGHT)
-    wide = Intrinsics(20.0, 20.0, 40.0, 30.0, 80, 60)
-    valid = undistortion(lens, wide, None).valid
+    valid = undistortion(lens, Intrinsics(20.0, 20.0, 40.0, 30.0, 80, 60), None).valid
     assert valid is not None
     radius = np.linalg.norm(room.pinhole_rays((20.0, 20.0, 40.0, 30.0), 80, 60)[..., :2], axis=-1)
     turn = np.sqrt(2 / 3)

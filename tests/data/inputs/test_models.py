@@ -112,8 +112,7 @@ def test_a_model_in_other_words_is_the_same(tmp_path, kind):
 def test_a_line_that_is_none_is_named(tmp_path, part, change, line):
     path = make_scene(tmp_path, text=True)
     file = path / "sparse/0" / f"{part}.txt"
-    content = file.read_bytes()
-    file.write_bytes(change(content))
+    file.write_bytes(change(file.read_bytes()))
     with pytest.raises(
         ValueError, match=rf"{part}.txt: not a readable COLMAP model: line \d+: expected .* got '{line}"
     ):
