@@ -4,11 +4,9 @@ import dataclasses
 
 import torch
 
-from nexwarp.cameras.camera import Camera
-from nexwarp.data import Scene
+import nexwarp as nw
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
-from nexwarp.train.trainer import Trainer
 
 WIDTH, HEIGHT, POINTS = 64, 48, 100
 ITERATIONS = 8
@@ -21,7 +19,7 @@ def rehearse(config: Config, device: torch.device) -> None:
     run. The choice of surfels to relocate runs too.
     """
     scene = tiny_scene()
-    trainer = Trainer(scene, tiny(config), device)
+    trainer = nw.Trainer(scene, tiny(config), device)
     trainer.run()
     if config.densify.relocate:
         trainer.densifier.unneeded(trainer.model(), trainer.views.cameras)
@@ -45,7 +43,7 @@ def tiny(config: Config) -> Config:
     )
 
 
-def tiny_scene() -> Scene:
+def tiny_scene() -> nw.Scene:
     """Make a scene of one photo of noise, for training and testing, and random points in front of its camera."""
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(POINTS, 3, generator=generator) * 2 - 1
@@ -54,5 +52,5 @@ def tiny_scene() -> Scene:
     viewmat[2, 3] = 4.0
     K = torch.tensor([[WIDTH, 0.0, WIDTH / 2], [0.0, WIDTH, HEIGHT / 2], [0.0, 0.0, 1.0]])
     colors = torch.randint(0, 256, (POINTS, 3), generator=generator, dtype=torch.uint8)
-    scene = Scene.from_tensors([photo], [Camera(viewmat, K, WIDTH, HEIGHT)], points, colors, test_every=0)
+    scene = nw.Scene.from_tensors([photo], [nw.Camera(viewmat, K, WIDTH, HEIGHT)], points, colors, test_every=0)
     return dataclasses.replace(scene, test=scene.train)

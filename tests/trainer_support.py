@@ -7,9 +7,7 @@ from typing import Any
 import torch
 
 import nexwarp as nw
-from nexwarp.data import Scene, View
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
-from nexwarp.train.trainer import Trainer
 
 TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
 # Rounds of density control at 3, 6 and 9 of 12 iterations, so that a short run has them all.
@@ -21,7 +19,7 @@ def small(**changes: Any) -> Config:
     return Config(**(settings | changes))
 
 
-def state_of(trainer: Trainer) -> dict[str, torch.Tensor]:
+def state_of(trainer: nw.Trainer) -> dict[str, torch.Tensor]:
     """Every tensor that the future of a run depends on."""
     state: dict[str, torch.Tensor] = dict(trainer._named_parameters())
     for name, parameter in list(state.items()):
@@ -31,23 +29,23 @@ def state_of(trainer: Trainer) -> dict[str, torch.Tensor]:
     return {name: value.detach().clone() for name, value in state.items()}
 
 
-def assert_same_state(one: Trainer, other: Trainer) -> None:
+def assert_same_state(one: nw.Trainer, other: nw.Trainer) -> None:
     first, second = state_of(one), state_of(other)
     assert first.keys() == second.keys()
     different = [name for name, value in first.items() if not torch.equal(value, second[name])]
     assert not different, different
 
 
-def trained(scene: Scene, config: Config) -> Trainer:
-    trainer = Trainer(scene, config, "cpu")
+def trained(scene: nw.Scene, config: Config) -> nw.Trainer:
+    trainer = nw.Trainer(scene, config, "cpu")
     trainer.run()
     return trainer
 
 
-def rescaled(scene: Scene, factor: float) -> Scene:
+def rescaled(scene: nw.Scene, factor: float) -> nw.Scene:
     """The same scene in other units."""
 
-    def moved(view: View) -> View:
+    def moved(view: nw.View) -> nw.View:
         c = view.camera
         viewmat = c.viewmat.clone()
         viewmat[:3, 3] *= factor
@@ -64,9 +62,9 @@ def rescaled(scene: Scene, factor: float) -> Scene:
     )
 
 
-def assert_resumed_alike(straight: Trainer, folder: Path, stop: int = 7, **options: Any) -> None:
+def assert_resumed_alike(straight: nw.Trainer, folder: Path, stop: int = 7, **options: Any) -> None:
     """Stopped after some steps, restored elsewhere and gone on: the state of an uninterrupted run, bit for bit."""
-    first, second = (Trainer(straight.scene, straight.config, "cpu", **options) for _ in range(2))
+    first, second = (nw.Trainer(straight.scene, straight.config, "cpu", **options) for _ in range(2))
     first.run(until=stop)
     first.save(folder)
     torch.manual_seed(99)

@@ -5,8 +5,6 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.model.model import Model
-from nexwarp.model.options import RenderOptions
 from nexwarp.run.evaluate import psnr
 from tests import scenes
 from tests.render_support import rays_of
@@ -23,7 +21,7 @@ def crowd():
     quats, scales = torch.randn(400, 4, generator=generator), 0.4 + 0.1 * torch.rand(400, 2, generator=generator)
     sh = 0.5 * torch.randn(400, 4, 3, generator=generator)
     surfels = nw.Surfels.from_activated(means, quats, scales, 0.95 * torch.ones(400), torch.ones(400, 2), sh)
-    return Model(surfels, None, options=RenderOptions(max_hits=2, background=BACKGROUND))
+    return nw.Model(surfels, None, options=nw.RenderOptions(max_hits=2, background=BACKGROUND))
 
 
 VIEWMAT = scenes.rigid((0.9, 0.1, 0.2, -0.1), (0.1, -0.2, 0.1)).float()

@@ -8,17 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from nexwarp.cameras.camera import Camera
+import nexwarp as nw
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.cameras.paths import focus, look_at, up_direction
 from nexwarp.cli import main as cli
 from nexwarp.data.ply import read_vertices
-from nexwarp.export.baked_scene import load_baked
 from nexwarp.model.buffers import load_buffers
 from nexwarp.model.edit import EDIT_FILE
-from nexwarp.model.model import Model
-from nexwarp.model.model_file import load
-from nexwarp.model.surfels import Surfels
 from nexwarp.run.edit import crop_command, measured
 from nexwarp.run.folder import keep_camera_path, open_model
 from tests.cli.support import picture, read, refused, snapshot
@@ -75,17 +71,17 @@ def test_the_ground_of_a_tilted_scene_becomes_y_0(tmp_path):
     quats = torch.tensor([[0.3, 0.8, -0.4, 0.2]]).expand(390, 4)
     scales = torch.cat([torch.full((380, 2), 0.1), torch.full((10, 2), 3.0)])
     ones = torch.ones(390)
-    surfels = Surfels.from_activated(
+    surfels = nw.Surfels.from_activated(
         means.float(), quats, scales, 0.9 * ones, torch.ones(390, 2), torch.zeros(390, 1, 3)
     )
-    Model(surfels, None).save(tmp_path)
+    nw.Model(surfels, None).save(tmp_path)
     K, up = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]]), torch.tensor([0.0, 0, 1]).double()
     cameras = {}
     for number in range(8):
         angle = number * math.pi / 4
         place = torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 1.5]).double()
         viewmat = look_at(place, torch.zeros(3).double(), up) @ torch.linalg.inv(turn)
-        cameras[f"{number}.png"] = Camera(viewmat.float(), K, 40, 30)
+        cameras[f"{number}.png"] = nw.Camera(viewmat.float(), K, 40, 30)
     save_cameras(tmp_path / CAMERAS_FILE, {"train": cameras, "test": {}})
     edit(tmp_path, "--level")
     levelled = open_model(tmp_path).frame.points(means.numpy())
@@ -143,10 +139,10 @@ def test_exports_are_in_the_new_coordinates_and_hold_what_is_left(finished):
     new = 2 * before - [1, 0, 0]
     left = (new[:, 0] >= -2) & (new[:, 0] <= 0.5)
     assert 0 < left.sum() < len(new) and np.allclose(centres(finished), new[left], atol=1e-5)
-    assert len(load(finished).surfels) == len(new), "the model's file and nexwarp.load have all surfels"
+    assert len(nw.load(finished).surfels) == len(new), "the model's file and nexwarp.load have all surfels"
     for kind in ("compact", "cameras"):
         assert cli.main(["export", str(finished), "--format", kind]) == 0
-    assert len(load(finished / "export" / "compact.safetensors").surfels) == left.sum()
+    assert len(nw.load(finished / "export" / "compact.safetensors").surfels) == left.sum()
     first = read(finished / "export", "camera_path.json")["camera_path"][0]["camera_to_world"]
     places = [2 * camera.position - torch.tensor([1.0, 0, 0]) for group in open_model(finished).cameras.values()
               for camera in group.values()]  # fmt: skip
@@ -177,7 +173,7 @@ def test_undo_gives_the_same_bits_and_evaluation_never_sees_edits(finished, caps
 
 def test_floaters_are_counted_and_belong_to_one_model(finished, capsys, monkeypatch):
     monkeypatch.setattr("nexwarp.run.edit.find_floaters", lambda model, *_: torch.arange(len(model.surfels)) < 3)
-    count = len(load(finished).surfels)
+    count = len(nw.load(finished).surfels)
     edit(finished, "--crop", "sphere", "0", "0", "0", "1.5")
     left = len(open_model(finished).model.surfels)
     edit(finished, "--remove-floaters", "--device", "cpu")
@@ -187,7 +183,7 @@ def test_floaters_are_counted_and_belong_to_one_model(finished, capsys, monkeypa
     before = snapshot(finished)
     edit(finished, "--remove-floaters", "--device", "cpu")
     assert snapshot(finished) == before, "none found"
-    model = load(finished)
+    model = nw.load(finished)
     with torch.no_grad():
         model.surfels.means.add_(1)
     model.save(finished)
@@ -233,11 +229,11 @@ def test_baked_exports_move_too(finished, monkeypatch):
     monkeypatch.setattr("nexwarp.export.glb.CUTOFF", 0.05)  # surfels of a short training are faint
     command, file = ["export", str(finished), "--format", "glb", "--device", "cpu"], finished / "export" / "scene.glb"
     assert cli.main(command) == 0
-    before = load_baked(file)
+    before = nw.load_baked(file)
     for move in MOVES:
         edit(finished, *move)
     assert cli.main(command) == 0
-    after, opened = load_baked(file), open_model(finished)
+    after, opened = nw.load_baked(file), open_model(finished)
     expected = opened.frame.points(before.shape.means.numpy())
     assert np.allclose(after.shape.means.numpy(), expected, atol=1e-4)
     assert_close(after.shape.scales, 3.5 * before.shape.scales, kind="gradient", name="half sides")
@@ -246,4 +242,4 @@ def test_baked_exports_move_too(finished, monkeypatch):
     assert_close(image, before.render(camera), kind="gradient", name="image", allow_flips=0.005)
     edit(finished, "--crop", "box", *map(str, np.quantile(expected, (0.1, 0.9), axis=0).ravel()))
     assert cli.main(command) == 0
-    assert 0 < len(load_baked(file).shape.means) < len(expected)
+    assert 0 < len(nw.load_baked(file).shape.means) < len(expected)

@@ -9,16 +9,12 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 import nexwarp as nw
-from nexwarp.cameras.camera import Camera
-from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
-from nexwarp.data import View
 from nexwarp.io.pictures import CAPTION_HEIGHT, to_uint8
 from nexwarp.run.evaluate import CONVENTION, psnr
 from nexwarp.run.folder import list_files
 from nexwarp.run.photo_table import save_photo_table
 from nexwarp.train.recipe import config_from_dict
-from nexwarp.train.trainer import Trainer
 from tests.cli.support import FLAGS, RUN_FILES, SMALL, picture, read, refused, snapshot
 from tests.data.test_scene import make_scene
 from tests.scene_writers import write_blender, write_points
@@ -71,7 +67,7 @@ def test_memory_that_ends_while_finishing_costs_no_training(scene, tmp_path, mon
 
     command = ["train", str(scene), "--run", str(tmp_path / "run"), *FLAGS]
     with monkeypatch.context() as patch:
-        patch.setattr(Trainer, "finish", full)
+        patch.setattr(nw.Trainer, "finish", full)
         assert cli.main(command) == 2
     told = "out of memory: needed 2.00 GiB; training is complete and saved: --resume finishes the run"
     assert capsys.readouterr().err == f"nexwarp: error: {told}\n" and cli.main([*command, "--resume"]) == 0
@@ -97,7 +93,7 @@ def test_the_table_of_photos_has_what_the_model_shows_of_each(trained, scene):
     assert sorted(row["photo"] for row in rows) == sorted(file.name for file in (scene / "images").iterdir())
     tested = {name: figures["psnr"] for name, figures in read(trained, "metrics.json")["views"].items()}
     assert {row["photo"] for row in rows if row["split"] == "test"} == tested.keys()
-    model, cameras = nw.load(trained), load_cameras(trained / "cameras.json")
+    model, cameras = nw.load(trained), nw.load_cameras(trained / "cameras.json")
     for row, written in zip(rows, psnrs, strict=True):
         name = row["photo"]
         rendering = to_uint8(model.render_image(cameras[row["split"]][name]))
@@ -106,10 +102,10 @@ def test_the_table_of_photos_has_what_the_model_shows_of_each(trained, scene):
 
 
 def test_a_blurred_photo_is_the_least_sharp_of_the_table(tmp_path):
-    camera = Camera(torch.eye(4), torch.tensor([[50.0, 0, 24], [0, 50.0, 18], [0, 0, 1]]), 48, 36, 0.1)
+    camera = nw.Camera(torch.eye(4), torch.tensor([[50.0, 0, 24], [0, 50.0, 18], [0, 0, 1]]), 48, 36, 0.1)
     noise = torch.rand(36, 48, 3, generator=torch.Generator().manual_seed(0))
     blurred = torch.from_numpy(gaussian_filter(noise.numpy(), (1.5, 1.5, 0)))
-    views = {name: View(camera, to_uint8(image), None, name) for name, image in (("a, b", noise), ("c", blurred))}
+    views = {name: nw.View(camera, to_uint8(image), None, name) for name, image in (("a, b", noise), ("c", blurred))}
     save_photo_table(tmp_path / "photos.csv", {"train": [*views.values()]}, {name: {"psnr": 20.0} for name in views})
     with (tmp_path / "photos.csv").open(newline="") as file:
         sharpness = {row["photo"]: float(row["sharpness"]) for row in csv.DictReader(file)}

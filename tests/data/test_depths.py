@@ -12,8 +12,6 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from nexwarp.cameras.camera import Camera
-from nexwarp.data import Scene, View
 from nexwarp.data.capture import Cloud
 from nexwarp.data.depth_files import read_depth
 from nexwarp.data.depth_fit import Fit, _error, fit_depths
@@ -101,7 +99,7 @@ def folder(tmp_path: Path) -> Path:
     return write_demo(tmp_path / "scene", WIDTH, HEIGHT, 4, points=300)
 
 
-def rendered(scene: Scene) -> dict[str, np.ndarray]:
+def rendered(scene: nw.Scene) -> dict[str, np.ndarray]:
     """Smooth depth maps that a plane before each camera could have."""
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
     return {view.name: 2.0 + 0.05 * columns + 0.02 * rows for view in (*scene.train, *scene.test)}
@@ -113,7 +111,7 @@ def write_maps(folder: Path, maps: dict[str, np.ndarray], end: str = ".npy") -> 
         WRITERS[f"a{end}"](folder / f"{Path(name).stem}{end}", values)
 
 
-def load_unfitted(folder: Path, monkeypatch: pytest.MonkeyPatch, **options: Any) -> Scene:
+def load_unfitted(folder: Path, monkeypatch: pytest.MonkeyPatch, **options: Any) -> nw.Scene:
     monkeypatch.setattr("nexwarp.data.scene.fit_depths", lambda views, *_: views)
     return nw.load_scene(folder, **options)
 
@@ -207,16 +205,16 @@ def test_maps_that_transforms_json_names(folder: Path, monkeypatch: pytest.Monke
         nw.load_scene(scene)
 
 
-def seen(values: np.ndarray | None, depths: np.ndarray, points: int = 60, seed: int = 0) -> View:
+def seen(values: np.ndarray | None, depths: np.ndarray, points: int = 60, seed: int = 0) -> nw.View:
     """A view with a map of `values`, and with points of which a tenth lie far off its `depths`."""
     rng = np.random.default_rng(seed)
-    camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]]), WIDTH, HEIGHT)
+    camera = nw.Camera(torch.eye(4), torch.tensor([[20.0, 0, 12], [0, 20, 9], [0, 0, 1]]), WIDTH, HEIGHT)
     rows, columns = rng.integers(0, HEIGHT, points), rng.integers(0, WIDTH, points)
     z = depths[rows, columns] * np.where(np.arange(points) % 10, 1.0 + 0.01 * rng.standard_normal(points), 3.0)
     positions = np.stack([(columns + 0.5 - 12) / 20 * z, (rows + 0.5 - 9) / 20 * z, z], axis=1)
     depth = None if values is None else torch.from_numpy(values).half()
     image = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
-    return View(camera, image, None, f"{seed}", points=torch.from_numpy(positions).float(), depth=depth)
+    return nw.View(camera, image, None, f"{seed}", points=torch.from_numpy(positions).float(), depth=depth)
 
 
 def truths(count: int) -> list[np.ndarray]:

@@ -9,9 +9,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.model.bounds import BOUNDS
-from nexwarp.model.exposures import Exposures
 from nexwarp.model.model_file import load, save_model
-from nexwarp.model.texture import DetailLimits
 from tests.model_file_support import rewrite
 from tests.narrowing import present
 from tests.scenes import make_camera, make_surfels, random_scene
@@ -54,8 +52,8 @@ def tiny_model() -> nw.Model:
     cameras = [tiny_camera.__wrapped__() for _ in range(3)]
     for index, camera in enumerate(cameras):
         camera.viewmat[:3, 3] += 0.3 * index
-    exposures = Exposures.of(0.2 * torch.randn(3, 3), cameras, (-0.3, -0.2, 0.4))
-    limits = DetailLimits(torch.full((12,), 0.05), torch.full((12,), 0.2))
+    exposures = nw.Exposures.of(0.2 * torch.randn(3, 3), cameras, (-0.3, -0.2, 0.4))
+    limits = nw.DetailLimits(torch.full((12,), 0.05), torch.full((12,), 0.2))
     return nw.Model(make_surfels(random_scene(12, width=16, height=12)), texture, exposures, limits)
 
 

@@ -7,12 +7,8 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.cameras.camera import Camera
-from nexwarp.data import Scene, View
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.buffers import render_buffers
-from nexwarp.model.exposures import Exposures
-from nexwarp.model.model import Model
 from nexwarp.model.render import draw
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train import exposure as exposure_calibration
@@ -20,7 +16,6 @@ from nexwarp.train.exposure import Observations, calibrate_exposures, choose_fit
 from nexwarp.train.losses import SATURATION, as_taken, photo_losses
 from nexwarp.train.recipe import Config, LossWeights, TextureConfig
 from nexwarp.train.target import Target, mean_color
-from nexwarp.train.trainer import Trainer
 from tests.narrowing import present
 from tests.scene_writers import exposure_at, with_exposures, write_demo
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
@@ -31,16 +26,16 @@ pytestmark = pytest.mark.usefixtures("one_torch_thread")
 K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
 
 
-def looking(x: float, turn: float = 0.0) -> Camera:
+def looking(x: float, turn: float = 0.0) -> nw.Camera:
     """A camera at (x, 0, 0), turned about y."""
     c, s = np.cos(turn), np.sin(turn)
     rotation = torch.tensor([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], dtype=torch.float32)
     viewmat = torch.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ torch.tensor([float(x), 0.0, 0.0])
-    return Camera(viewmat, K, 64, 48)
+    return nw.Camera(viewmat, K, 64, 48)
 
 
-def light(camera: Camera, pixels: torch.Tensor, lens: tuple[float, float]) -> torch.Tensor:
+def light(camera: nw.Camera, pixels: torch.Tensor, lens: tuple[float, float]) -> torch.Tensor:
     """What a lens leaves of the light at pixel coordinates (N, 2), its powers being of tan^2."""
     tangents = (pixels - torch.tensor([camera.cx, camera.cy])) / torch.tensor([camera.fx, camera.fy])
     t = tangents.square().sum(1, keepdim=True)
@@ -49,7 +44,7 @@ def light(camera: Camera, pixels: torch.Tensor, lens: tuple[float, float]) -> to
 
 def photographs(
     log_gains: torch.Tensor, outliers: float = 0.0, lens: tuple[float, float] = (0.0, 0.0)
-) -> tuple[list[Camera], list[torch.Tensor], list[torch.Tensor]]:
+) -> tuple[list[nw.Camera], list[torch.Tensor], list[torch.Tensor]]:
     """Photos of coloured points, each a pixel, with gains, through a lens; some pixels are of something else."""
     generator = torch.Generator().manual_seed(3)
     points = torch.rand(900, 3, generator=generator) * torch.tensor([3.0, 1.6, 1.0]) + torch.tensor([-1.5, -0.8, 2.2])
@@ -74,9 +69,9 @@ def photographs(
     return cameras, photos, seen
 
 
-def views(cameras: list[Camera], photos: list[torch.Tensor], points: list[torch.Tensor]) -> list[View]:
+def views(cameras: list[nw.Camera], photos: list[torch.Tensor], points: list[torch.Tensor]) -> list[nw.View]:
     parts = zip(cameras, photos, points, strict=True)
-    return [View(camera, photo, None, f"{i}", None, seen) for i, (camera, photo, seen) in enumerate(parts)]
+    return [nw.View(camera, photo, None, f"{i}", None, seen) for i, (camera, photo, seen) in enumerate(parts)]
 
 
 def photo_gains(*photographs: Any) -> tuple[np.ndarray, tuple[float, float, float]]:
@@ -105,7 +100,7 @@ def test_the_falloff_of_the_lens_is_found(lens):
     found, falloff = photo_gains(cameras, photos, points)
     assert abs(found - gains.numpy()).max() < 0.03
     camera = cameras[0]
-    exposures = Exposures.of(torch.from_numpy(found), cameras, falloff)
+    exposures = nw.Exposures.of(torch.from_numpy(found), cameras, falloff)
     row, column = torch.meshgrid(torch.arange(48) + 0.5, torch.arange(64) + 0.5, indexing="ij")
     expected = light(camera, torch.stack([column, row], -1).reshape(-1, 2), lens).reshape(48, 64, 1)
     assert expected.min() < 0.85 and (present(exposures.falloff_of(camera)) / expected - 1).abs().max() < 0.01
@@ -114,21 +109,21 @@ def test_the_falloff_of_the_lens_is_found(lens):
 def test_the_falloff_is_the_angle_s():
     """A window sees what the whole does there, and so does a camera of twice the pixels; beyond all points it ends."""
     cameras = [looking(0.0), looking(1.0)]
-    exposures = Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.25))
+    exposures = nw.Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.25))
     whole = present(exposures.falloff_of(cameras[0]))
     assert whole.shape == (48, 64, 1) and whole.max() > 0.999
     torch.testing.assert_close(present(exposures.falloff_of(cameras[0].crop(10, 5, 20, 30))), whole[5:35, 10:30])
     K2 = K * torch.tensor([[3.0], [3.0], [1.0]])
-    torch.testing.assert_close(present(exposures.falloff_of(Camera(torch.eye(4), K2, 192, 144)))[1::3, 1::3], whole)
+    torch.testing.assert_close(present(exposures.falloff_of(nw.Camera(torch.eye(4), K2, 192, 144)))[1::3, 1::3], whole)
     wide = present(exposures.falloff_of(cameras[0].crop(-500, -500, 1000, 1000)))
     assert wide.min().item() == pytest.approx(np.exp(-0.3)) and wide[0, 0] == wide.min()
-    assert Exposures.of(torch.zeros(2, 3), cameras).falloff_of(cameras[0]) is None
+    assert nw.Exposures.of(torch.zeros(2, 3), cameras).falloff_of(cameras[0]) is None
     assert exposures.falloff_of(cameras[1]) is whole  # made once
     for left in range(50):
         exposures.falloff_of(cameras[0].crop(left, 0, 20, 30))
     assert torch.equal(present(exposures.falloff_of(cameras[0])), whole)
     with pytest.raises(ValueError, match=r"^falloff: expected a largest squared tangent > 0, got 0$"):
-        Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.0))
+        nw.Exposures.of(torch.zeros(2, 3), cameras, (-0.2, -0.1, 0.0))
 
 
 def test_known_gains_are_found_beside_saturated_skies():
@@ -205,7 +200,7 @@ def test_photos_that_share_nothing_keep_their_colours():
 def test_a_camera_gets_the_gains_around_it():
     cameras = [looking(x) for x in np.linspace(0, 6, 25)]
     course = 0.3 * torch.sin(torch.linspace(0, 6, 25))[:, None] * torch.tensor([1.0, 0.5, -1.0])
-    exposures = Exposures.of(course, cameras)
+    exposures = nw.Exposures.of(course, cameras)
     assert (torch.stack([exposures.gains(camera).log() for camera in cameras]) - course).abs().max() < 0.01
     low, high = course.min(0).values, course.max(0).values
     for x in np.linspace(0.1, 5.9, 50):  # between the photos, too
@@ -225,8 +220,8 @@ def test_a_rendering_is_times_its_gains(device: torch.device, falloff):
     surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
     options = nw.RenderOptions(background=(0.2, 0.5, 0.9))
     plain = nw.render(surfels, texture, camera, background=options.background)
-    cameras = [camera, Camera(torch.eye(4), camera.K.cpu(), camera.width, camera.height)]
-    photos = Exposures.of(torch.tensor([[0.3, 0.0, -0.2], [0.5, 0.1, 0.1]]), cameras, falloff).to(device)
+    cameras = [camera, nw.Camera(torch.eye(4), camera.K.cpu(), camera.width, camera.height)]
+    photos = nw.Exposures.of(torch.tensor([[0.3, 0.0, -0.2], [0.5, 0.1, 0.1]]), cameras, falloff).to(device)
     gains = photos.gains(camera)
     if falloff is not None:
         gains = gains * present(photos.falloff_of(camera))
@@ -269,18 +264,18 @@ def test_brighter_than_a_saturated_pixel_is_no_error():
 def test_the_mean_colour_is_that_of_the_mean_exposure():
     cameras, generator = [looking(0.1 * i) for i in range(4)], torch.Generator().manual_seed(0)
     gains = torch.tensor([[0.5], [0.8], [1.25], [2.0]]).expand(4, 3)
-    exposures_ = Exposures.of(gains.log(), cameras, (-0.3, -0.2, 0.4))
+    exposures_ = nw.Exposures.of(gains.log(), cameras, (-0.3, -0.2, 0.4))
     scene = 0.1 + 0.2 * torch.rand(48, 64, 3, generator=generator)
     light = present(exposures_.falloff_of(cameras[0]))
-    views = [View(c, to_uint8(scene * g * light), None, "") for c, g in zip(cameras, gains, strict=True)]
+    views = [nw.View(c, to_uint8(scene * g * light), None, "") for c, g in zip(cameras, gains, strict=True)]
     calibration = exposure_calibration.ExposureCalibration(exposures_, gains, torch.zeros(0, 3))
     assert mean_color(views, calibration) == pytest.approx(scene.mean((0, 1)).tolist(), abs=2e-3)
 
 
-def trained(scene: Scene, **changes: Any) -> tuple[Model, float]:
+def trained(scene: nw.Scene, **changes: Any) -> tuple[nw.Model, float]:
     """A small training with some settings changed, and the PSNR of its test views."""
     texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
-    trainer = Trainer(scene, Config(iterations=150, max_surfels=400, texture=texture, **changes), "cpu")
+    trainer = nw.Trainer(scene, Config(iterations=150, max_surfels=400, texture=texture, **changes), "cpu")
     trainer.run()
     model = trainer.finish()
     return model, evaluate(model, scene.test)["psnr"]
@@ -301,17 +296,17 @@ def test_no_exposures_where_none_are_wanted(tmp_path, change):
     scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=6, points=60)))
     texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
     config = Config(iterations=2, max_surfels=40, texture=texture, **change)
-    assert Trainer(scene, config, "cpu").finish().exposures is None
+    assert nw.Trainer(scene, config, "cpu").finish().exposures is None
     # A background that is known is no photo's business.
     known = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))
     plain = dataclasses.replace(config, exposures=True, mask_mode="ignore")
-    assert Trainer(known, plain, "cpu").finish().exposures is None
-    assert Trainer(scene, plain, "cpu").finish().exposures is not None
+    assert nw.Trainer(known, plain, "cpu").finish().exposures is None
+    assert nw.Trainer(scene, plain, "cpu").finish().exposures is not None
 
 
-def make_exposures(count: int, **changes: torch.Tensor) -> Exposures:
+def make_exposures(count: int, **changes: torch.Tensor) -> nw.Exposures:
     values = {name: torch.zeros(count, 3) for name in ("log_gains", "positions", "directions", "coefficients")}
-    return Exposures(values | {"mean": torch.zeros(3), "lengths": torch.ones(2)} | changes)
+    return nw.Exposures(values | {"mean": torch.zeros(3), "lengths": torch.ones(2)} | changes)
 
 
 def test_predicted_gains_stay_within_those_of_the_photos() -> None:
@@ -326,7 +321,7 @@ def test_exposures_of_too_few_and_too_many_photos_are_refused(tmp_path: Path, co
     """In files, too: `Exposures` is what reads them."""
     with pytest.raises(ValueError, match=f"exposures: expected 1 to 1,000 photos, got {count:,}"):
         make_exposures(count)
-    model = Model(make_surfels(random_scene(3)), None, make_exposures(2))
+    model = nw.Model(make_surfels(random_scene(3)), None, make_exposures(2))
     for name in ("log_gains", "positions", "directions", "coefficients"):
         setattr(model.exposures, name, torch.zeros(count, 3))
     with pytest.raises(ValueError, match="expected 1 to 1,000 photos"):

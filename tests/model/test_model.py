@@ -15,12 +15,9 @@ from nexwarp.cli import main as cli
 from nexwarp.data.scene import SceneSource
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.buffers import load_buffers, render_buffers
-from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.model.render import draw
-from nexwarp.model.texture import DetailLimits
 from nexwarp.run.folder import RunRecord, create_run
-from nexwarp.train.recipe import Config
 from tests.cli.support import picture
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_finite
@@ -47,11 +44,11 @@ def full_model(device: torch.device | str = "cpu", falloff: tuple[float, float, 
     surfels = make_surfels(random_scene(40, device=device))
     cameras = cameras_of()
     log_gains = torch.tensor([[0.3, 0.0, -0.2], [0.1, 0.2, 0.1], [-0.4, -0.2, 0.1]])
-    exposures = Exposures.of(log_gains, cameras, falloff).to(device)
+    exposures = nw.Exposures.of(log_gains, cameras, falloff).to(device)
     generator = torch.Generator().manual_seed(5)
     # Around the depths of 2 to 5 that the surfels have.
     depths = 2.5 + torch.rand(2, len(surfels), generator=generator)
-    limits = DetailLimits(*(depths / cameras[0].focal * torch.tensor([[1.0], [1.2]])).to(device))
+    limits = nw.DetailLimits(*(depths / cameras[0].focal * torch.tensor([[1.0], [1.2]])).to(device))
     return nw.Model(surfels, make_texture(device=device), exposures, limits, OPTIONS, {"near": 0.01, "iteration": 7})
 
 
@@ -70,7 +67,7 @@ def pure(model: nw.Model, camera: nw.Camera, **parts: Any) -> nw.Rendering:
 def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flags: list[str], saved: Exposure) -> None:
     """To the bit, with exposures, vignetting and detail limits, and the buffers too; by default as the model says."""
     run, cameras = tmp_path / "run", cameras_of()
-    create_run(run, RunRecord(SceneSource(str(tmp_path / "scene")), Config()))
+    create_run(run, RunRecord(SceneSource(str(tmp_path / "scene")), nw.Config()))
     full = full_model()
     full.options = full.options.changed(exposure=saved)
     full.save(run)
@@ -293,7 +290,7 @@ def test_parts_that_do_not_fit_are_named() -> None:
         ("texture", TypeError, (surfels, surfels)),
         ("exposures", TypeError, (surfels, texture, {"max_hits": 2})),
         ("detail_limits", TypeError, (surfels, texture, None, torch.ones(len(surfels)))),
-        ("detail_limits", ValueError, (surfels, texture, None, DetailLimits(torch.ones(3), torch.ones(3)))),
+        ("detail_limits", ValueError, (surfels, texture, None, nw.DetailLimits(torch.ones(3), torch.ones(3)))),
         ("options", TypeError, (surfels, texture, None, None, {"max_hits": 2})),
     ]
     for name, error, arguments in bad:

@@ -14,14 +14,11 @@ import torch
 
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
-from nexwarp.data import Scene
 from nexwarp.data.scene import SceneSource
 from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
-from nexwarp.train.recipe import Config
-from nexwarp.train.trainer import Trainer
 from tests.model.test_bounds import tiny_camera, tiny_model
 from tests.model_file_support import refused, rewrite
 from tests.scenes import make_camera, random_scene
@@ -59,7 +56,7 @@ def test_a_model_with_unknown_keys_and_tensors_loads_the_same(tmp_path: Path) ->
 
 
 def test_a_run_with_unknown_keys_reads_the_same(tmp_path: Path) -> None:
-    create_run(tmp_path, RunRecord(SceneSource("demo", downscale=2), Config(seed=3)))
+    create_run(tmp_path, RunRecord(SceneSource("demo", downscale=2), nw.Config(seed=3)))
     record = read_run(tmp_path)
 
     def extend(data: Any) -> None:
@@ -86,7 +83,7 @@ def test_cameras_with_unknown_keys_load_the_same(tmp_path: Path) -> None:
     assert after.keys() == before.keys() and torch.equal(after["train"]["a"].viewmat, before["train"]["a"].viewmat)
 
 
-def test_a_checkpoint_with_unknown_keys_and_tensors_restores_the_same(tmp_path: Path, tiny_scene: Scene) -> None:
+def test_a_checkpoint_with_unknown_keys_and_tensors_restores_the_same(tmp_path: Path, tiny_scene: nw.Scene) -> None:
     config = small(iterations=4)
     done = trained(tiny_scene, config)
     tensors, state = done.snapshot()
@@ -95,7 +92,7 @@ def test_a_checkpoint_with_unknown_keys_and_tensors_restores_the_same(tmp_path: 
     tensors["labels"] = torch.zeros(5, dtype=torch.int64)
     state |= ANYTHING | {"config": state["config"] | ANYTHING}
     save_checkpoint(tmp_path, tensors, state)
-    resumed = Trainer(tiny_scene, config, "cpu")
+    resumed = nw.Trainer(tiny_scene, config, "cpu")
     resumed.restore(tmp_path)
     assert_same_state(resumed, done)
 
@@ -108,7 +105,7 @@ def write_version(kind: str, folder: Path, version: object) -> tuple[Path, Calla
         rewrite(file, lambda _, meta: meta.update(data))
         return file, lambda: nw.load(file)
     if kind == "config":
-        create_run(folder, RunRecord(SceneSource("demo"), Config()))
+        create_run(folder, RunRecord(SceneSource("demo"), nw.Config()))
         change_json(folder / "config.json", lambda old: old.update(data))
         return folder / "config.json", lambda: read_run(folder)
     if kind == "checkpoint":

@@ -5,13 +5,9 @@ import torch
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import look_at
-from nexwarp.data import Scene, View
-from nexwarp.model.surfels import Surfels
 from nexwarp.train.finish import seen_directions, smooth_sh
 from nexwarp.train.recipe import MIN_STRENGTH, Config, TextureConfig
-from nexwarp.train.trainer import Trainer
 from tests.reference.sh import basis as sh_basis
 from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
@@ -21,20 +17,20 @@ CONSTANT = 0.28209479177387814  # the harmonic of degree 0
 ROUGHNESS = torch.tensor([(degree * (degree + 1) / 12) ** 2 for degree in range(4) for _ in range(2 * degree + 1)])
 
 
-def view(position: list[float], mask: torch.Tensor | None = None) -> View:
+def view(position: list[float], mask: torch.Tensor | None = None) -> nw.View:
     K = torch.tensor([[30.0, 0.0, SIDE / 2], [0.0, 30.0, SIDE / 2], [0.0, 0.0, 1.0]])
-    camera = Camera(look_at(torch.tensor(position), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])), K, SIDE, SIDE)
-    return View(camera, torch.zeros(SIDE, SIDE, 3, dtype=torch.uint8), mask, "view.png")
+    camera = nw.Camera(look_at(torch.tensor(position), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])), K, SIDE, SIDE)
+    return nw.View(camera, torch.zeros(SIDE, SIDE, 3, dtype=torch.uint8), mask, "view.png")
 
 
-def around(angles: list[float]) -> list[View]:
+def around(angles: list[float]) -> list[nw.View]:
     return [view([4 * math.sin(angle), 0.5 * angle, -4 * math.cos(angle)]) for angle in angles]
 
 
-def blob(device: torch.device) -> Surfels:
+def blob(device: torch.device) -> nw.Surfels:
     """A surfel in the middle, seen from all sides but its edge, and one behind all cameras."""
     generator = torch.Generator().manual_seed(3)
-    surfels = Surfels.from_activated(
+    surfels = nw.Surfels.from_activated(
         torch.tensor([[0.0, 0.0, 0.0], [0.0, 300.0, 0.0]]),
         torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
         torch.full((2, 2), 0.4),
@@ -45,7 +41,7 @@ def blob(device: torch.device) -> Surfels:
     return surfels.to(device)
 
 
-def colors(surfels: Surfels, views: list[View], sh: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+def colors(surfels: nw.Surfels, views: list[nw.View], sh: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
     """(V, N, 3), of SH alone, without the offset and the limit at 0 that colours have."""
     offset = 10.0
     found = []
@@ -81,7 +77,7 @@ def test_directions_count_by_the_weight_that_surfels_have_there(device: torch.de
     assert_close(found[known], expected[known], kind="value", name="products")
 
 
-def one(k: int, surfels: Surfels) -> tuple[torch.Tensor, torch.Tensor]:
+def one(k: int, surfels: nw.Surfels) -> tuple[torch.Tensor, torch.Tensor]:
     sh = torch.zeros(len(surfels), 16, 3, device=surfels.device)
     sh[:, k] = 1.0
     return sh[:, :1].contiguous(), sh[:, 1:].contiguous()
@@ -110,19 +106,19 @@ def test_unseen_surfels_get_one_colour_and_none_are_no_trouble(device: torch.dev
     surfels, views = blob(device), around([-0.5, 0.5])  # one view alone is told by one colour
     sh0, shN = smooth_sh(nw.Model(surfels, None), views, 0.01)
     assert torch.equal(sh0[1], surfels.sh0[1]) and not shN[1].any() and shN[0].abs().max() > 1e-3
-    empty = Surfels({name: x[:0] for name, x in surfels.state_dict().items()})
+    empty = nw.Surfels({name: x[:0] for name, x in surfels.state_dict().items()})
     assert [x.shape for x in smooth_sh(nw.Model(empty, None), views, 0.01)] == [(0, 1, 3), (0, 15, 3)]
-    flat = Surfels({name: x[:, :0] if name == "shN" else x for name, x in surfels.state_dict().items()})
+    flat = nw.Surfels({name: x[:, :0] if name == "shN" else x for name, x in surfels.state_dict().items()})
     for a, b in zip(smooth_sh(nw.Model(flat, None), views, 0.01), (flat.sh0, flat.shN), strict=True):
         assert torch.equal(a, b)
 
 
 @pytest.mark.usefixtures("one_torch_thread")
-def test_finishing_leaves_the_training_as_it_is(tiny_scene: Scene, device: torch.device) -> None:
+def test_finishing_leaves_the_training_as_it_is(tiny_scene: nw.Scene, device: torch.device) -> None:
     """A model of its own: training goes on as if none had been asked for, on CUDA with graphs recorded anew."""
     texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
     config = Config(iterations=40, max_surfels=200, texture=texture, deterministic=device.type == "cuda")
-    asked, other = (Trainer(tiny_scene, config, device) for _ in range(2))
+    asked, other = (nw.Trainer(tiny_scene, config, device) for _ in range(2))
     # At any one step there may be no graph: where lists turn out too short, the next step drops it.
     replayed: list[bool] = []
 

@@ -3,9 +3,7 @@
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from nexwarp.data import Scene
-from nexwarp.model.exposures import Exposures
-from nexwarp.train.trainer import Trainer
+import nexwarp as nw
 from tests.trainer_support import small
 
 PRODUCTS = {"mm", "mv", "bmm", "addmm", "addmv", "addbmm", "baddbmm", "dot", "vdot", "addr"}
@@ -25,15 +23,15 @@ class Products(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def test_steps_and_frames_call_no_blas(tiny_scene: Scene) -> None:
-    trainer = Trainer(tiny_scene, small(), "cpu")
+def test_steps_and_frames_call_no_blas(tiny_scene: nw.Scene) -> None:
+    trainer = nw.Trainer(tiny_scene, small(), "cpu")
     with Products() as step:
         for _ in range(4):  # rounds of density control among them
             trainer.step()
     assert step.found == []
     model = trainer.finish()
     cameras = [view.camera for view in tiny_scene.train]
-    model.exposures = Exposures.of(0.05 * torch.randn(len(cameras), 3), cameras, (-0.2, -0.05, 1.0))
+    model.exposures = nw.Exposures.of(0.05 * torch.randn(len(cameras), 3), cameras, (-0.2, -0.05, 1.0))
     assert model.detail_limits is not None
     with Products() as frame, torch.no_grad():
         model.render(tiny_scene.test[0].camera)

@@ -16,31 +16,25 @@ import numpy as np
 import torch
 from PIL import Image
 
-from nexwarp.cameras.camera import Camera
+import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
-from nexwarp.data import load_scene
 from nexwarp.data.depth_files import read_depth
 from nexwarp.data.images import MAKE, MODEL, read_image, read_mask, read_transparent
 from nexwarp.data.ply import read_ply
 from nexwarp.data.scene import SceneSource
 from nexwarp.data.sfm.photos import camera_groups, read_photos
 from nexwarp.export.bake import bake
-from nexwarp.export.baked_scene import load_baked
 from nexwarp.export.glb import make_cards, save_glb
 from nexwarp.export.splats import gaussians, save_splats_ply
 from nexwarp.export.web.baked import encode_baked
 from nexwarp.io.json_files import write_json
 from nexwarp.io.pictures import load_exr, save_exr
 from nexwarp.model.edit import Edit, checksum, frame_of, kept_surfels, moved_surfels, read_edits, write_edits
-from nexwarp.model.exposures import Exposures
-from nexwarp.model.model import Model
 from nexwarp.model.model_file import load, save_model
-from nexwarp.model.texture import DetailLimits
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
 from nexwarp.run.photo_table import load_photo_table
 from nexwarp.train.recipe import Config, TextureConfig
-from nexwarp.train.trainer import Trainer
 from tests.model_file_support import make_model
 from tests.robustness.fuzz_inputs import Files
 from tests.scene_writers import (
@@ -90,8 +84,8 @@ def _scene(folder: Path) -> Path:
     return write_demo(folder, WIDTH, HEIGHT, VIEWS, points=6)
 
 
-def _cameras(folder: Path) -> dict[str, Camera]:
-    scene = load_scene(_scene(folder))
+def _cameras(folder: Path) -> dict[str, nw.Camera]:
+    scene = nw.load_scene(_scene(folder))
     return {view.name: view.camera for view in (*scene.train, *scene.test)}
 
 
@@ -135,11 +129,11 @@ def _blender(folder: Path) -> list[Files]:
     return [_files(write_blender(_scene(folder / "colmap"), folder / "blender"))]
 
 
-def _some_model(folder: Path) -> Model:
+def _some_model(folder: Path) -> nw.Model:
     """Return a model with every part that a file can hold."""
     model = make_model(5)
-    model.exposures = Exposures.of(0.1 * torch.randn(VIEWS, 3), list(_cameras(folder).values()), (-0.3, -0.2, 0.4))
-    model.detail_limits = DetailLimits(torch.full((5,), 0.02), torch.full((5,), 0.2))
+    model.exposures = nw.Exposures.of(0.1 * torch.randn(VIEWS, 3), list(_cameras(folder).values()), (-0.3, -0.2, 0.4))
+    model.detail_limits = nw.DetailLimits(torch.full((5,), 0.02), torch.full((5,), 0.2))
     return model
 
 
@@ -157,7 +151,7 @@ def _read_model(folder: Path) -> None:
 
 
 @torch.no_grad()
-def _check_rendering(model: Model, camera: Camera | None = None) -> None:
+def _check_rendering(model: nw.Model, camera: nw.Camera | None = None) -> None:
     """Raise AssertionError unless a picture of a few pixels is finite, from the camera or one that sees the surfels."""
     out = model.render(dataclasses.replace(camera or make_camera(random_scene(5)), width=4, height=3))
     for name in ("image", "alpha", "depths", "expected_depth", "normals"):
@@ -165,11 +159,11 @@ def _check_rendering(model: Model, camera: Camera | None = None) -> None:
 
 
 @functools.cache  # it takes seconds
-def _trainer() -> Trainer:
+def _trainer() -> nw.Trainer:
     """Return a trainer after two steps."""
     with tempfile.TemporaryDirectory() as folder:
-        scene = load_scene(_scene(Path(folder) / "scene"))
-    trainer = Trainer(scene, Config(iterations=4, max_surfels=20, sh_degree=1, texture=TEXTURE), "cpu")
+        scene = nw.load_scene(_scene(Path(folder) / "scene"))
+    trainer = nw.Trainer(scene, Config(iterations=4, max_surfels=20, sh_degree=1, texture=TEXTURE), "cpu")
     trainer.run(until=2)
     return trainer
 
@@ -303,7 +297,7 @@ def _baked(folder: Path) -> list[Files]:
 
 
 def _read_baked(folder: Path) -> None:
-    scene = load_baked(folder / "scene.glb" if (folder / "scene.glb").is_file() else folder)
+    scene = nw.load_baked(folder / "scene.glb" if (folder / "scene.glb").is_file() else folder)
     camera = dataclasses.replace(make_camera(random_scene(5)), width=4, height=3)
     assert bool(torch.isfinite(scene.render(camera)).all()), "the image is not finite"
 
@@ -346,10 +340,10 @@ def _read_linear(folder: Path) -> None:
 TARGETS = {
     target.name: target
     for target in (
-        FuzzTarget("colmap_binary", _colmap(False), load_scene, (".bin",)),
-        FuzzTarget("colmap_text", _colmap(True), load_scene, (".txt",)),
-        FuzzTarget("nerfstudio", _nerfstudio, load_scene, ("transforms.json",)),
-        FuzzTarget("blender", _blender, lambda folder: load_scene(folder, background="white"), (".json",)),
+        FuzzTarget("colmap_binary", _colmap(False), nw.load_scene, (".bin",)),
+        FuzzTarget("colmap_text", _colmap(True), nw.load_scene, (".txt",)),
+        FuzzTarget("nerfstudio", _nerfstudio, nw.load_scene, ("transforms.json",)),
+        FuzzTarget("blender", _blender, lambda folder: nw.load_scene(folder, background="white"), (".json",)),
         FuzzTarget("model", _model, _read_model, (".safetensors",)),
         FuzzTarget("config", _config, read_run, (".json",)),
         FuzzTarget("cameras", _run_cameras, _read_cameras, (".json",)),

@@ -8,15 +8,13 @@ from pathlib import Path
 
 import pytest
 
+import nexwarp as nw
 from nexwarp.cli import main as cli
-from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE
 from nexwarp.train import recipe
 from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.finish import FinishObserver
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
-from nexwarp.train.report import StepReport
-from nexwarp.train.trainer import Trainer
 from tests.scene_writers import expose_photos, write_demo
 from tests.subprocesses import python_path
 
@@ -33,25 +31,25 @@ MOMENTS = [(stage, count) for count in (4, 2, 8) for stage in STAGES]
 def main(stage: str, count: int, arguments: list[str]) -> None:
     """The command line, whose default preset is a small one, and which kills itself."""
     recipe.PRESETS["default"] = SMALL
-    finish, step = Trainer.finish, Trainer.step
+    finish, step = nw.Trainer.finish, nw.Trainer.step
 
     def die(name: str, done: int) -> None:
         if (name, done) == (stage, count):
             os.kill(os.getpid(), signal.SIGKILL)
 
-    def step_or_die(trainer: Trainer) -> StepReport:
+    def step_or_die(trainer: nw.Trainer) -> nw.StepReport:
         report = step(trainer)
         die("training", trainer.iteration)
         return report
 
-    def finish_or_die(trainer: Trainer, observe: FinishObserver) -> Model:
+    def finish_or_die(trainer: nw.Trainer, observe: FinishObserver) -> nw.Model:
         def watch(name: str, done: int, total: int) -> None:
             die(name, done)
             observe(name, done, total)
 
         return finish(trainer, watch)
 
-    Trainer.finish, Trainer.step = finish_or_die, step_or_die  # type: ignore[method-assign,assignment]
+    nw.Trainer.finish, nw.Trainer.step = finish_or_die, step_or_die  # type: ignore[method-assign,assignment]
     sys.exit(cli.main(arguments))
 
 

@@ -21,8 +21,6 @@ import torch
 import warp as wp
 
 import nexwarp as nw
-from nexwarp.train.recipe import preset
-from nexwarp.train.trainer import Trainer
 from tests.rehearsal import tiny_scene
 from tests.render_support import loss
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
@@ -76,7 +74,7 @@ def separate_allocations(device: torch.device) -> Iterator[None]:
 def test_steps_and_frames_run(device: torch.device) -> None:
     """As by default and with fixed-order sums."""
     scene = tiny_scene()
-    base = preset("default")
+    base = nw.preset("default")
     config = dataclasses.replace(
         base,
         max_surfels=200,
@@ -84,7 +82,7 @@ def test_steps_and_frames_run(device: torch.device) -> None:
         densify=dataclasses.replace(base.densify, fraction=1.0, prune_opacity=0.02),
     )
     for deterministic in (False, True):
-        trainer = Trainer(scene, dataclasses.replace(config, deterministic=deterministic), device)
+        trainer = nw.Trainer(scene, dataclasses.replace(config, deterministic=deterministic), device)
         for iteration in ITERATIONS:
             trainer.iteration = iteration - 1
             trainer.step()

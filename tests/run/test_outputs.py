@@ -15,19 +15,15 @@ from nexwarp.cli import main as cli
 from nexwarp.data.scene import SceneSource
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.buffers import load_buffers
-from nexwarp.model.exposures import Exposures
-from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
-from nexwarp.model.options import RenderOptions
 from nexwarp.run.folder import RunRecord, create_run
-from nexwarp.train.recipe import Config
 from tests.cameras.test_paths import ring, row
 from tests.cli.support import picture, refused
 from tests.data.inputs import room
 from tests.scenes import make_surfels, make_texture, random_scene
 
 TRAIN, TEST = ["b.png", "c.jpg", "d.png", "e.png"], ["a.png", "sub/f.png"]
-OPTIONS = RenderOptions(background=(0.1, 0.2, 0.3))
+OPTIONS = nw.RenderOptions(background=(0.1, 0.2, 0.3))
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +33,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     scene = random_scene(40)
     scene["means"] = scene["means"] - scene["means"].mean(0) + torch.tensor([1.0, -2.0, 0.3])
-    create_run(run, RunRecord(SceneSource(str(run.parent / "scene"), "images_2"), Config()))
-    save_model(run, Model(make_surfels(scene), make_texture(), options=OPTIONS))
+    create_run(run, RunRecord(SceneSource(str(run.parent / "scene"), "images_2"), nw.Config()))
+    save_model(run, nw.Model(make_surfels(scene), make_texture(), options=OPTIONS))
     cameras = [each.to(torch.float32) for each in ring(6)]
     sets = {"train": dict(zip(TRAIN, cameras[1:5], strict=True)), "test": dict(zip(TEST, cameras[::5], strict=True))}
     save_cameras(run / "cameras.json", sets)
@@ -87,7 +83,7 @@ def test_info_tells_the_range_of_exposures(run: Path, capsys: pytest.CaptureFixt
     cameras = load_cameras(run / "cameras.json")
     model = nw.load(run)
     log_gains = torch.tensor([[0.3, 0.0, -0.2], [0.1, 0.2, 0.1], [-0.4, -0.2, 0.1], [0.0, 0.0, 0.0]])
-    model.exposures = Exposures.of(log_gains, list(cameras["train"].values()))
+    model.exposures = nw.Exposures.of(log_gains, list(cameras["train"].values()))
     save_model(run, model)
     assert command("info", run) == 0
     assert "0.67 to 1.35 times the photos' mean" in capsys.readouterr().out
@@ -213,7 +209,7 @@ def test_exported_cameras_are_those_of_the_photos_files(tmp_path: Path, camera: 
     folder = tmp_path / "scene"
     room.write_colmap(folder, room.write_photos(folder / "images"), camera)
     source, run = SceneSource(str(folder), downscale=2), tmp_path / "run"
-    create_run(run, RunRecord(source, Config()))
+    create_run(run, RunRecord(source, nw.Config()))
     save_cameras(run / "cameras.json", source.load().cameras)
     assert command("export", run, "--format", "cameras", "--out", folder) == 0
     data = json.loads((folder / "transforms.json").read_text())

@@ -9,14 +9,11 @@ from torch import nn
 
 import nexwarp as nw
 from nexwarp.cameras.camera import Camera, reduced
-from nexwarp.data import Scene
-from nexwarp.model.render import render
 from nexwarp.model.surfels import PARAMETERS
 from nexwarp.train import densify
 from nexwarp.train.densify import DensityControl, split_surfels
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import Config, DensifyConfig
-from nexwarp.train.trainer import Trainer
 from tests.ranks_support import run_ranks
 from tests.reference.collect import rotations
 from tests.scenes import make_surfels, random_scene
@@ -313,9 +310,9 @@ def test_rounds_come_when_the_paper_says():
 # Relocation: the surfels that the training views need least make room for others
 
 
-def test_what_no_image_shows_goes_first(tiny_scene: Scene) -> None:
+def test_what_no_image_shows_goes_first(tiny_scene: nw.Scene) -> None:
     """Surfels outside of all images and behind opaque ones; what is removed is nowhere more than what stays is."""
-    trainer = Trainer(tiny_scene, small(iterations=30), "cpu")
+    trainer = nw.Trainer(tiny_scene, small(iterations=30), "cpu")
     surfels = trainer.surfels
     hidden = torch.arange(0, len(surfels), 7)
     with torch.no_grad():
@@ -332,14 +329,14 @@ def test_what_no_image_shows_goes_first(tiny_scene: Scene) -> None:
     assert chosen.sum() == len(surfels) // 2 and chosen[hidden].all()
     most = torch.zeros(len(surfels))
     for camera in cameras:  # at full size, a sum of weights is that of half the size but for aliasing
-        out = render(surfels, None, camera)
+        out = nw.render(surfels, None, camera)
         most = torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1 / out.alpha.numel())))
     assert most[chosen].mean() < 0.2 * most[~chosen].mean() and not least_contributing(0.0).any()
 
 
-def test_ranks_share_the_views(tiny_scene: Scene, tmp_path: Path) -> None:
+def test_ranks_share_the_views(tiny_scene: nw.Scene, tmp_path: Path) -> None:
     """Each renders some of them, and all choose what one process would."""
-    model = Trainer(tiny_scene, small(iterations=30), "cpu").model()
+    model = nw.Trainer(tiny_scene, small(iterations=30), "cpu").model()
     control = densifier_of(model.surfels, relocate=0.3)
     cameras = [view.camera for view in tiny_scene.train]
     rendered: list[int] = []
@@ -374,7 +371,7 @@ def test_rounds_at_the_budget_relocate_in_the_first_part_of_density_control() ->
         DensifyConfig(relocate=0.6)
 
 
-def test_others_take_their_place(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_others_take_their_place(tiny_scene: nw.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     removed = []
 
     def first(control, model, cameras):
@@ -384,7 +381,7 @@ def test_others_take_their_place(tiny_scene: Scene, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(DensityControl, "unneeded", first)
     config = small(iterations=120, densify=dataclasses.replace(OFTEN, relocate=0.2, prune_opacity=0.0, fraction=0.2))
     budget = 50
-    trainer = Trainer(tiny_scene, dataclasses.replace(config, max_surfels=budget), "cpu")
+    trainer = nw.Trainer(tiny_scene, dataclasses.replace(config, max_surfels=budget), "cpu")
     counts: dict[int, int] = {}
     trainer.run(observe=lambda progress: counts.update({progress.iteration: progress.surfels}))
     assert [iteration for iteration, *_ in removed] == [30]

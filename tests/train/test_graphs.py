@@ -9,15 +9,11 @@ from typing import Any
 import pytest
 import torch
 
+import nexwarp as nw
 from nexwarp import ops
-from nexwarp.cameras.camera import Camera
-from nexwarp.data import Scene, View
 from nexwarp.model import graphs as step_graphs
 from nexwarp.train import target as training_views
-from nexwarp.train.densify import DensityControl
 from nexwarp.train.recipe import Config, DensifyConfig, with_settings
-from nexwarp.train.target import Target
-from nexwarp.train.trainer import Trainer
 from tests.trainer_support import TEXTURE, assert_same_state
 
 pytestmark = pytest.mark.cuda
@@ -31,20 +27,20 @@ SETTINGS: dict[str, Any] = {
 }
 
 
-def trained(scene: Scene, **changes: Any) -> Trainer:
-    trainer = Trainer(scene, Config(**(SETTINGS | changes)), "cuda")
+def trained(scene: nw.Scene, **changes: Any) -> nw.Trainer:
+    trainer = nw.Trainer(scene, Config(**(SETTINGS | changes)), "cuda")
     trainer.run()
     return trainer
 
 
-def graphs_of(trainer: Trainer) -> int:
+def graphs_of(trainer: nw.Trainer) -> int:
     assert trainer.graphs is not None
     return sum(stage.captured is not None for stage in trainer.graphs.stages.values())
 
 
-def half(view: View) -> View:
+def half(view: nw.View) -> nw.View:
     camera, width = view.camera, view.camera.width // 2
-    small = Camera(camera.viewmat, camera.K, width, camera.height, near=camera.near)
+    small = nw.Camera(camera.viewmat, camera.K, width, camera.height, near=camera.near)
     return dataclasses.replace(view, camera=small, image=view.image[:, :width].contiguous())
 
 
@@ -60,7 +56,7 @@ def half(view: View) -> View:
     ],
     ids=str,
 )
-def test_graphs_give_the_bits_of_launches(tiny_scene: Scene, changes: dict[str, Any]) -> None:
+def test_graphs_give_the_bits_of_launches(tiny_scene: nw.Scene, changes: dict[str, Any]) -> None:
     parts = {name: x for name, x in changes.items() if "." in name}
     config = with_settings(Config(**SETTINGS), parts)
     changes = {name: x for name, x in changes.items() if name not in parts}
@@ -71,7 +67,7 @@ def test_graphs_give_the_bits_of_launches(tiny_scene: Scene, changes: dict[str, 
     assert_same_state(replayed, launched)
 
 
-def test_photos_with_and_without_depth_maps_share_a_graph(tiny_scene: Scene) -> None:
+def test_photos_with_and_without_depth_maps_share_a_graph(tiny_scene: nw.Scene) -> None:
     maps = [torch.full(view.image.shape[:2], 3.0).half() for view in tiny_scene.train]
     pairs = enumerate(zip(tiny_scene.train, maps, strict=True))
     views = [dataclasses.replace(view, depth=depth if index % 2 else None) for index, (view, depth) in pairs]
@@ -81,14 +77,14 @@ def test_photos_with_and_without_depth_maps_share_a_graph(tiny_scene: Scene) -> 
     assert_same_state(replayed, launched)
 
 
-def test_the_first_step_after_a_round_is_captured(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_step_after_a_round_is_captured(tiny_scene: nw.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rounds replace tensors, and nothing else of what a step launches."""
-    trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    trainer = nw.Trainer(tiny_scene, Config(**SETTINGS), "cuda")
     optimize = trainer._optimize
     launched: list[int] = []
     rounds: list[int] = []
 
-    def noted(target: Target) -> step_graphs.StepResult:
+    def noted(target: nw.Target) -> step_graphs.StepResult:
         if not torch.cuda.is_current_stream_capturing():
             launched.append(trainer.iteration)
         return optimize(target)
@@ -104,29 +100,29 @@ def test_the_first_step_after_a_round_is_captured(tiny_scene: Scene, monkeypatch
     assert sum(iteration + 1 in launched for iteration in rounds) <= len(rounds) // 2
 
 
-def test_teachers_too(tiny_scene: Scene) -> None:
+def test_teachers_too(tiny_scene: nw.Scene) -> None:
     """Steps with a teacher's picture have the graph of steps with photos."""
     teachers, runs = [trained(tiny_scene, seed=seed).finish() for seed in (1, 2)], []
     for graphs in (False, True):
-        runs.append(Trainer(tiny_scene, Config(**(SETTINGS | {"cuda_graphs": graphs})), "cuda", teachers=teachers))
+        runs.append(nw.Trainer(tiny_scene, Config(**(SETTINGS | {"cuda_graphs": graphs})), "cuda", teachers=teachers))
         runs[-1].run()
     launched, replayed = runs
     assert graphs_of(replayed) == 1
     assert_same_state(replayed, launched)
 
 
-def test_each_step_has_its_own_losses(tiny_scene: Scene) -> None:
+def test_each_step_has_its_own_losses(tiny_scene: nw.Scene) -> None:
     """They are read later, when the graph has long written others."""
     seen: dict[bool, list[dict[str, torch.Tensor]]] = {}
     for graphs in (False, True):
-        trainer = Trainer(tiny_scene, Config(**(SETTINGS | {"cuda_graphs": graphs})), "cuda")
+        trainer = nw.Trainer(tiny_scene, Config(**(SETTINGS | {"cuda_graphs": graphs})), "cuda")
         seen[graphs] = [trainer.step().losses for _ in range(40)]
     for launched, replayed in zip(seen[False], seen[True], strict=True):
         assert {k: v.item() for k, v in launched.items()} == {k: v.item() for k, v in replayed.items()}
 
 
 @pytest.mark.parametrize("forgotten", [10**6, 0], ids=["launched", "make room"])
-def test_sizes_beyond_the_first_few(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch, forgotten: int) -> None:
+def test_sizes_beyond_the_first_few(tiny_scene: nw.Scene, monkeypatch: pytest.MonkeyPatch, forgotten: int) -> None:
     halves = [half(view) if index % 2 else view for index, view in enumerate(tiny_scene.train)]
     scene = dataclasses.replace(tiny_scene, train=halves)
     launched = trained(scene, cuda_graphs=False)
@@ -152,7 +148,7 @@ def test_a_first_training_in_a_process(tiny_folder: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_photos_on_the_host_and_random_backgrounds(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photos_on_the_host_and_random_backgrounds(tiny_scene: nw.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training_views, "PHOTO_SHARE", 0.0)
     scene = dataclasses.replace(tiny_scene, random_background=True)
     launched = trained(scene, cuda_graphs=False)
@@ -161,11 +157,11 @@ def test_photos_on_the_host_and_random_backgrounds(tiny_scene: Scene, monkeypatc
     assert_same_state(replayed, launched)
 
 
-def test_going_back_changes_nothing(tiny_scene: Scene) -> None:
+def test_going_back_changes_nothing(tiny_scene: nw.Scene) -> None:
     """The steps after it are those of a launched training that goes back, too."""
     runs = []
     for graphs in (False, True):
-        trainer = Trainer(tiny_scene, Config(**(SETTINGS | {"cuda_graphs": graphs})), "cuda")
+        trainer = nw.Trainer(tiny_scene, Config(**(SETTINGS | {"cuda_graphs": graphs})), "cuda")
         trainer.run(until=40)
         before = trainer.snapshot()
         trainer.run(until=53)
@@ -192,7 +188,7 @@ def lack_memory() -> None:
 def test_a_capture_that_fails_leaves_training_as_it_is(tiny_scene, monkeypatch, fault):
     """In the middle of a step, too: what it did to the gradients is gone."""
     launched = trained(tiny_scene, cuda_graphs=False)
-    replayed: Any = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    replayed: Any = nw.Trainer(tiny_scene, Config(**SETTINGS), "cuda")
     real = ops.captured
 
     calls = []
@@ -215,13 +211,13 @@ def test_a_capture_that_fails_leaves_training_as_it_is(tiny_scene, monkeypatch, 
     assert_same_state(replayed, launched)
 
 
-def test_a_step_that_lacks_the_memory_of_graphs_is_done_without_them(tiny_scene: Scene) -> None:
+def test_a_step_that_lacks_the_memory_of_graphs_is_done_without_them(tiny_scene: nw.Scene) -> None:
     launched = trained(tiny_scene, cuda_graphs=False)
-    trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    trainer = nw.Trainer(tiny_scene, Config(**SETTINGS), "cuda")
     optimize = trainer._optimize
     failed: list[int] = []
 
-    def failing(target: Target) -> step_graphs.StepResult:
+    def failing(target: nw.Target) -> step_graphs.StepResult:
         if trainer.iteration == 31 and not failed:  # the first step after a round
             assert trainer.graphs is not None and trainer.graphs.keeper is not None  # whose memory may be missing
             failed.append(1)
@@ -234,10 +230,10 @@ def test_a_step_that_lacks_the_memory_of_graphs_is_done_without_them(tiny_scene:
     assert_same_state(trainer, launched)
 
 
-def test_lists_that_outgrow_a_graph_are_recorded_anew(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lists_that_outgrow_a_graph_are_recorded_anew(tiny_scene: nw.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Too little room is slow but right; the next steps have more."""
     launched = trained(tiny_scene, cuda_graphs=False)
-    trainer = Trainer(tiny_scene, Config(**SETTINGS), "cuda")
+    trainer = nw.Trainer(tiny_scene, Config(**SETTINGS), "cuda")
     asked: list[ops.ListCapacity] = []
 
     def fits(room: ops.ListCapacity, **_: bool) -> bool:
@@ -250,20 +246,20 @@ def test_lists_that_outgrow_a_graph_are_recorded_anew(tiny_scene: Scene, monkeyp
     assert_same_state(trainer, launched)
 
 
-def test_rounds_at_the_budget_keep_the_graph(tiny_scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rounds_at_the_budget_keep_the_graph(tiny_scene: nw.Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """Children take the rows of pruned surfels: tensors stay where they are, and graphs stay valid."""
     changes = {"max_surfels": 200, "densify": DensifyConfig(every=60, fraction=0.5, prune_opacity=0.09)}
     launched = trained(tiny_scene, cuda_graphs=False, **changes)
-    trainer = Trainer(tiny_scene, Config(**(SETTINGS | changes)), "cuda")
+    trainer = nw.Trainer(tiny_scene, Config(**(SETTINGS | changes)), "cuda")
     captured: list[int] = []
     replaced: list[int] = []
-    stacked, control = step_graphs._stacked, DensityControl.step
+    stacked, control = step_graphs._stacked, nw.DensityControl.step
 
     def noted(*given: Any) -> Any:
         captured.append(trainer.iteration)
         return stacked(*given)
 
-    def counted(densifier: DensityControl, *given: Any) -> torch.Tensor:
+    def counted(densifier: nw.DensityControl, *given: Any) -> torch.Tensor:
         before = len(densifier.surfels)
         rows = control(densifier, *given)
         if len(rows.unique()) < len(rows) == before:
@@ -272,7 +268,7 @@ def test_rounds_at_the_budget_keep_the_graph(tiny_scene: Scene, monkeypatch: pyt
 
     monkeypatch.setattr(ops, "fits", lambda room, **_: True)  # short lists are slow but right, and no reason here
     monkeypatch.setattr(step_graphs, "_stacked", noted)
-    monkeypatch.setattr(DensityControl, "step", counted)
+    monkeypatch.setattr(nw.DensityControl, "step", counted)
     trainer.run()
     assert len(replaced) > 3 and captured
     assert not [i for i in captured if replaced[0] < i <= trainer.densifier.config.stop]

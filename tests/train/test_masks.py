@@ -4,23 +4,21 @@ from typing import Any
 import pytest
 import torch
 
-from nexwarp.data import Scene, View
+import nexwarp as nw
 from nexwarp.run.evaluate import Evaluation, evaluate
-from nexwarp.train.recipe import Config
 from nexwarp.train.target import mean_color
-from nexwarp.train.trainer import Trainer
 from tests.tolerances import assert_close
 from tests.trainer_support import TEXTURE
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
-def make_trainer(scene: Scene, **settings) -> Trainer:
+def make_trainer(scene: nw.Scene, **settings) -> nw.Trainer:
     values: dict[str, Any] = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE} | settings
-    return Trainer(scene, Config(**values), "cpu")
+    return nw.Trainer(scene, nw.Config(**values), "cpu")
 
 
-def test_background_is_the_given_one_the_scenes_or_the_mean(scene: Scene) -> None:
+def test_background_is_the_given_one_the_scenes_or_the_mean(scene: nw.Scene) -> None:
     photos = torch.stack([view.image for view in scene.train]).double() / 255
     assert mean_color(scene.train) == pytest.approx(photos.mean((0, 1, 2)).tolist(), abs=1e-9)
     assert make_trainer(scene).render_options().background == mean_color(scene.train)
@@ -29,7 +27,7 @@ def test_background_is_the_given_one_the_scenes_or_the_mean(scene: Scene) -> Non
     assert make_trainer(white).render_options().background == (1.0, 1.0, 1.0)
 
 
-def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) -> None:
+def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: nw.Scene) -> None:
     alpha = torch.full((36, 48), 255, dtype=torch.uint8)
     alpha[:10] = 51
     views = [dataclasses.replace(v, alpha=alpha) for v in scene.train]
@@ -46,7 +44,7 @@ def test_random_backgrounds_go_behind_photo_and_rendering_alike(scene: Scene) ->
     assert trainer.render_options().background == (1.0, 1.0, 1.0)
 
 
-def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
+def test_a_mask_as_background_empties_what_it_leaves_out(scene: nw.Scene) -> None:
     mask = torch.zeros(36, 48, dtype=torch.bool)
     mask[:, :24] = True
     halves = dataclasses.replace(scene, train=[dataclasses.replace(view, mask=mask) for view in scene.train])
@@ -64,7 +62,7 @@ def test_a_mask_as_background_empties_what_it_leaves_out(scene: Scene) -> None:
     assert alphas["background"] < 0.75 * alphas["ignore"]
 
 
-def test_masks_take_part_in_the_judgement(scene: Scene) -> None:
+def test_masks_take_part_in_the_judgement(scene: nw.Scene) -> None:
     trainer = make_trainer(scene)
     mask = torch.zeros(36, 48, dtype=torch.bool)
     mask[:, :24] = True
@@ -72,7 +70,7 @@ def test_masks_take_part_in_the_judgement(scene: Scene) -> None:
     spoilt = dataclasses.replace(view, image=torch.where(mask[..., None], view.image, 255 - view.image))
     model = trainer.model()
 
-    def judge(*views: View, mode: str = "ignore") -> Evaluation:
+    def judge(*views: nw.View, mode: str = "ignore") -> Evaluation:
         return evaluate(model, views, mask_mode=mode, metrics=("psnr", "ssim", "flip"))
 
     one, other = judge(view), judge(spoilt)

@@ -11,19 +11,17 @@ import pytest
 import safetensors.torch
 import torch
 
+import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.cli import session
-from nexwarp.data import Scene
 from nexwarp.errors import RankError, SceneError, SettingError
 from nexwarp.machine import derived_seed
 from nexwarp.model.model_file import MODEL_FILE
-from nexwarp.model.texture import NeuralTexture
 from nexwarp.train import recipe
 from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.parallel import MOST_CAPTURED_BYTES, ParallelTrainer, scale_for_batch, sums_beside
 from nexwarp.train.ranks.ranks import WAIT_VARIABLE, Ranks, check_count
 from nexwarp.train.recipe import Config, DensifyConfig
-from nexwarp.train.trainer import Trainer
 from tests.cli.support import refused
 from tests.ranks_support import (
     CPU,
@@ -58,7 +56,7 @@ def short_config() -> Config:
     return small(iterations=24)
 
 
-def test_an_incomplete_last_step_is_the_mean_of_its_views(scene: Scene, tmp_path: Path) -> None:
+def test_an_incomplete_last_step_is_the_mean_of_its_views(scene: nw.Scene, tmp_path: Path) -> None:
     """Of 5 views, 3 ranks render 3, then 2: the third one repeats a view with weight 0."""
 
     def work(ranks: Ranks) -> object:
@@ -74,7 +72,7 @@ def test_an_incomplete_last_step_is_the_mean_of_its_views(scene: Scene, tmp_path
 @pytest.mark.parametrize(
     ("size", "steps"), [(2, 200), (3, 60), pytest.param(3, 200, marks=pytest.mark.slow)], ids=["2", "3", "3 for long"]
 )
-def test_ranks_train_one_model(scene: Scene, tmp_path: Path, size: int, steps: int) -> None:
+def test_ranks_train_one_model(scene: nw.Scene, tmp_path: Path, size: int, steps: int) -> None:
     """One fork of the ranks for the laws of a whole training: a process costs more than a law."""
 
     def work(ranks: Ranks) -> object:
@@ -124,14 +122,14 @@ def test_ranks_train_one_model(scene: Scene, tmp_path: Path, size: int, steps: i
         # Each alone has weighted its loss by 1 / size.
         assert_close(value, torch.stack([each[name] for each in alone]).sum(0), kind="gradient", name=name)
     # One process goes on from the checkpoint of several.
-    trainer = Trainer(scene, short_config(), CPU)
+    trainer = nw.Trainer(scene, short_config(), CPU)
     trainer.restore(tmp_path / "run")
     assert trainer.iteration == 12
     trainer.run()
     assert trainer.iteration == 24
 
 
-def test_each_epoch_sees_each_view_once(scene: Scene) -> None:
+def test_each_epoch_sees_each_view_once(scene: nw.Scene) -> None:
     """Whatever the number of ranks, views come in one order, with random numbers of their own."""
     views = len(scene.train)
     taken: dict[int, list[int]] = {}
@@ -154,16 +152,16 @@ def test_each_epoch_sees_each_view_once(scene: Scene) -> None:
     assert len({derived_seed(0, n, k) for n in range(1000) for k in range(2)}) == 2000
 
 
-def test_rates_follow_the_square_root_of_the_batch(scene: Scene) -> None:
-    one = Trainer(scene, short_config(), CPU)
-    four = Trainer(scene, short_config(), CPU)
+def test_rates_follow_the_square_root_of_the_batch(scene: nw.Scene) -> None:
+    one = nw.Trainer(scene, short_config(), CPU)
+    four = nw.Trainer(scene, short_config(), CPU)
     scale_for_batch(four.optimizer, 4)
     for before, after in zip(one.optimizer.param_groups, four.optimizer.param_groups, strict=True):
         assert after["ends"] == pytest.approx(tuple(2 * rate for rate in before["ends"]))
         assert after["betas"] == pytest.approx((0.9**4, 0.999**4))
 
 
-def test_ranks_that_do_not_fit_are_refused_alike(scene: Scene, tmp_path: Path) -> None:
+def test_ranks_that_do_not_fit_are_refused_alike(scene: nw.Scene, tmp_path: Path) -> None:
     """All ranks raise the same error, whichever of them it is about."""
     few = dataclasses.replace(scene, train=scene.train[:1])
     view = scene.train[3]
@@ -245,15 +243,15 @@ def test_ranks_save_by_the_clock_of_the_first(tiny_folder: Path, tmp_path: Path,
 
     def work(rank: int) -> int:
         saved: list[int] = []
-        save = Trainer.save_checkpoint
+        save = nw.Trainer.save_checkpoint
 
-        def note(trainer: Trainer, run: Path) -> None:
+        def note(trainer: nw.Trainer, run: Path) -> None:
             saved.append(trainer.iteration)
             (tmp_path / f"{rank}.json").write_text(json.dumps(saved))
             save(trainer, run)
 
         patch = pytest.MonkeyPatch()  # of a process that ends
-        patch.setattr(Trainer, "save_checkpoint", note)
+        patch.setattr(nw.Trainer, "save_checkpoint", note)
         patch.setattr(session, "monotonic", itertools.count(step=(20, 1000)[rank]).__next__)
         return cli.main(["train", str(tiny_folder), "--run", str(tmp_path / "run"), *TRAIN])
 
@@ -264,7 +262,7 @@ def test_ranks_save_by_the_clock_of_the_first(tiny_folder: Path, tmp_path: Path,
 
 def test_many_gradients_are_summed_after_the_graph() -> None:
     """61 numbers a surfel less its error are 60; the grid counts only where hits are textured."""
-    surfels, texture = make_surfels(random_scene(3)), NeuralTexture(levels=2, table_size=2**10, features=4)
+    surfels, texture = make_surfels(random_scene(3)), nw.NeuralTexture(levels=2, table_size=2**10, features=4)
     ours = sum(x.numel() for x in texture.parameters())
     most = (MOST_CAPTURED_BYTES // 4 - ours) // 60
     for count, beside in ((most, False), (most + 1, True)):

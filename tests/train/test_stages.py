@@ -10,7 +10,6 @@ import torch
 from rich.console import Console
 
 import nexwarp as nw
-from nexwarp import Config, Model, Scene, Trainer
 from nexwarp.cli import main as cli
 from nexwarp.cli.display import time_left
 from nexwarp.cli.session import Session
@@ -22,13 +21,12 @@ from nexwarp.train import trainer as trainer_module
 from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import TextureConfig
-from nexwarp.train.report import StepReport
 from nexwarp.train.stages import VIEW_COST, OwnTeachers, StageRunner, divide, plan_teachers, shortened
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 CPU = torch.device("cpu")
-CONFIG = Config(
+CONFIG = nw.Config(
     iterations=20, max_surfels=60, teachers=2, exposures=False, texture=TextureConfig(levels=4, table_size=1024)
 )
 OWN = {"count": 2, "iterations": 4, "max_surfels": 240}
@@ -36,12 +34,12 @@ SETTINGS = ("texture.table_size=1024", "texture.levels=4", "exposures=false")
 SMALL = ["--max-surfels", "60", "--device", "cpu", *(text for each in SETTINGS for text in ("--set", each))]
 
 
-def same(one: Model, other: Model) -> bool:
+def same(one: nw.Model, other: nw.Model) -> bool:
     theirs = other.state_dict()
     return all(torch.equal(x, theirs[name]) for name, x in one.state_dict().items())
 
 
-def settings_of(config: Config, own: OwnTeachers) -> list[Config]:
+def settings_of(config: nw.Config, own: OwnTeachers) -> list[nw.Config]:
     """The settings of a run's stages, the student's last."""
     return [stage.config for stage in divide(config, own)]
 
@@ -79,13 +77,13 @@ def test_a_fast_run_has_the_iterations_that_its_photos_need(preset, changes, pho
     ],
 )
 def test_a_run_has_teachers_where_photos_are_few(changes: dict[str, Any], photos: int, count: int) -> None:
-    assert plan_teachers(dataclasses.replace(Config(), **changes), photos).count == count
+    assert plan_teachers(dataclasses.replace(nw.Config(), **changes), photos).count == count
 
 
 @pytest.mark.parametrize("iterations", [7, 30, 12_345, 30_000])
 @pytest.mark.parametrize("count", [1, 2, 3, 8])
 def test_teachers_have_two_fifths_of_the_iterations(iterations: int, count: int) -> None:
-    config = Config(iterations=iterations, teachers=count, seed=5)
+    config = nw.Config(iterations=iterations, teachers=count, seed=5)
     if iterations <= count:
         with pytest.raises(SettingError, match="iterations: expected more than the teachers' 8, got 7"):
             divide(config, plan_teachers(config, 20))
@@ -103,18 +101,18 @@ def test_teachers_have_two_fifths_of_the_iterations(iterations: int, count: int)
     ("budget", "teachers"), [(60, 240), (9_999, 39_996), (10_000, 40_000), (39_999, 40_000), (40_001, 40_001)]
 )
 def test_teachers_of_a_small_student_are_larger(budget: int, teachers: int) -> None:
-    config = Config(max_surfels=budget, teachers=2)
+    config = nw.Config(max_surfels=budget, teachers=2)
     *before, student = settings_of(config, plan_teachers(config, 20))
     assert {each.max_surfels for each in before} == {teachers} and student.max_surfels == budget
     # As in a run from before.
     assert {each.max_surfels for each in settings_of(config, OwnTeachers(2, 10))[:-1]} == {budget}
 
 
-def test_train_is_a_training_for_each_stage(tiny_scene: Scene, tmp_path: Path) -> None:
+def test_train_is_a_training_for_each_stage(tiny_scene: nw.Scene, tmp_path: Path) -> None:
     """Teachers, then the student with them; its callbacks count the steps of all."""
     seen: list[int] = []
 
-    def note(step: StepReport) -> None:
+    def note(step: nw.StepReport) -> None:
         seen.append(step.iteration)
 
     found = nw.train(tiny_scene, CONFIG, device=CPU, callbacks=[note])
@@ -157,18 +155,18 @@ def model_of(run: Path) -> bytes:
     return (run / "model.safetensors").read_bytes()
 
 
-def test_the_command_does_what_train_does(finished: Path, tiny_scene: Scene, tmp_path: Path) -> None:
+def test_the_command_does_what_train_does(finished: Path, tiny_scene: nw.Scene, tmp_path: Path) -> None:
     expected = nw.train(tiny_scene, CONFIG, device=CPU)
     assert same(nw.load(finished), nw.load(expected.save(tmp_path)))
 
 
 def test_fast_runs_are_shortened_in_python_and_by_the_command(
-    tiny_folder: Path, tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny_folder: Path, tiny_scene: nw.Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stages, "SHORTEST", 1)
     photos = len(tiny_scene.train)
     assert photos < CONFIG.iterations
-    steps: list[StepReport] = []
+    steps: list[nw.StepReport] = []
     config = dataclasses.replace(CONFIG, steps_a_photo=1, teachers=0)
     nw.train(tiny_scene, config, device=CPU, callbacks=[steps.append])
     assert len(steps) == photos
@@ -229,9 +227,9 @@ def test_a_stopped_run_goes_on_where_it_was(finished, command, tmp_path, monkeyp
     """Whatever the stage that the signal comes in."""
     steps: list[None] = []
     taken: list[None] = []
-    step = Trainer.step
+    step = nw.Trainer.step
 
-    def killed(trainer: Trainer) -> StepReport:
+    def killed(trainer: nw.Trainer) -> nw.StepReport:
         steps.append(None)
         if len(steps) > stop:
             raise KeyboardInterrupt
@@ -239,20 +237,20 @@ def test_a_stopped_run_goes_on_where_it_was(finished, command, tmp_path, monkeyp
 
     run = tmp_path / "run"
     with monkeypatch.context() as patched:
-        patched.setattr(Trainer, "step", killed)
+        patched.setattr(nw.Trainer, "step", killed)
         assert command(run, "--checkpoint-every", "1") == 130
     assert not (run / "model.safetensors").exists()
 
-    def counted(trainer: Trainer) -> StepReport:
+    def counted(trainer: nw.Trainer) -> nw.StepReport:
         taken.append(None)
         return step(trainer)
 
-    monkeypatch.setattr(Trainer, "step", counted)
+    monkeypatch.setattr(nw.Trainer, "step", counted)
     assert command(run, "--resume") == 0
     assert len(taken) == 20 - stop and model_of(run) == model_of(finished)
 
 
-def test_a_longer_run_keeps_its_teachers(run: Path, command: Callable[..., int], tiny_scene: Scene) -> None:
+def test_a_longer_run_keeps_its_teachers(run: Path, command: Callable[..., int], tiny_scene: nw.Scene) -> None:
     """All further iterations are the student's."""
     teachers = [(run / "teachers" / name / "model.safetensors").read_bytes() for name in "12"]
     assert command(run, "--resume", iterations=30) == 0
@@ -336,7 +334,7 @@ def test_a_record_with_invalid_teachers_is_refused(tmp_path: Path) -> None:
     assert read_run(run).own == OwnTeachers(2, 4)  # of a run from before, whose teachers have its budget
 
 
-def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
+def test_a_viewer_sees_all_steps(tiny_scene: nw.Scene, tmp_path: Path) -> None:
     """The model that it draws is that of the stage that runs, and the steps count to the run's iterations."""
     steps: list[int] = []
 
@@ -356,7 +354,7 @@ def test_a_viewer_sees_all_steps(tiny_scene: Scene, tmp_path: Path) -> None:
     assert steps == [*range(1, 21)] and drawn == [1, 2, 3, 4, 1, 2, 3, 4, *range(1, 13)]
 
 
-def test_the_time_left_is_that_of_all_stages(tiny_scene: Scene, tmp_path: Path) -> None:
+def test_the_time_left_is_that_of_all_stages(tiny_scene: nw.Scene, tmp_path: Path) -> None:
     """Before the first step, all steps and renderings are left; after the last one, those that finish and evaluate."""
     photos, tests = len(tiny_scene.train), len(tiny_scene.test)
     record = RunRecord(SceneSource(str(tiny_scene.path)), CONFIG, own=OwnTeachers(2, 4, 240))

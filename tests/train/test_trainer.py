@@ -8,10 +8,8 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.data import View
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.recipe import DensifyConfig, LearningRates
-from nexwarp.train.trainer import Trainer
 from tests.narrowing import neural
 from tests.scene_writers import with_exposures
 from tests.tolerances import assert_close
@@ -20,13 +18,13 @@ from tests.trainer_support import OFTEN, TEXTURE, assert_resumed_alike, assert_s
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 
-def mean_psnr(trainer: Trainer, views: list[View]) -> float:
+def mean_psnr(trainer: nw.Trainer, views: list[nw.View]) -> float:
     return evaluate(trainer.model(), views)["psnr"]
 
 
 def test_a_trainer_is_freed_with_its_last_reference(scene):
     """A cycle would keep a teacher's memory until the garbage collector comes, while the next one trains."""
-    trainer = Trainer(scene, small(), "cpu")
+    trainer = nw.Trainer(scene, small(), "cpu")
     trainer.step()
     left = weakref.ref(trainer)
     gc.disable()
@@ -58,7 +56,7 @@ def test_same_seed_same_run_and_other_seeds_differ(scene):
 def test_deterministic_runs_are_the_same_on_cuda(scene):
     runs, exposed = [], with_exposures(scene)
     for _ in range(3):
-        trainer = Trainer(exposed, small(iterations=60, max_surfels=400, deterministic=True), "cuda")
+        trainer = nw.Trainer(exposed, small(iterations=60, max_surfels=400, deterministic=True), "cuda")
         trainer.run()
         runs.append(trainer)
     assert not torch.are_deterministic_algorithms_enabled()
@@ -74,7 +72,7 @@ def test_deterministic_runs_are_the_same_on_cuda(scene):
 
 def test_it_learns(scene):
     # On black: on the photos' mean colour a run starts with less to learn.
-    trainer = Trainer(scene, small(iterations=80, max_surfels=400, background=(0.0, 0.0, 0.0)), "cpu")
+    trainer = nw.Trainer(scene, small(iterations=80, max_surfels=400, background=(0.0, 0.0, 0.0)), "cpu")
     before, losses = mean_psnr(trainer, scene.train), []
     trainer.run(lambda progress: losses.append(progress.loss()))
     epoch = len(scene.train)
@@ -84,7 +82,7 @@ def test_it_learns(scene):
 
 
 def test_progress_tells_what_happened(scene):
-    trainer = Trainer(scene, small(), "cpu")
+    trainer = nw.Trainer(scene, small(), "cpu")
     seen: list[nw.StepReport] = []
     trainer.run(seen.append)
     assert [p.iteration for p in seen] == list(range(1, 13)) and seen[-1].surfels == len(trainer.surfels)
@@ -101,7 +99,7 @@ def test_progress_tells_what_happened(scene):
 
 def test_rates_are_log_linear_between_their_ends(scene):
     config = small(iterations=9, rates=LearningRates(mlp=(1e-3, 1e-5)))
-    trainer, rates = Trainer(scene, config, "cpu"), []
+    trainer, rates = nw.Trainer(scene, config, "cpu"), []
     trainer.run(lambda _: rates.append([group["lr"] for group in trainer.optimizer.param_groups]))
     assert trainer.optimizer.defaults["eps"] == 1e-15  # the paper's
     r, s = config.rates, scene.scale
@@ -115,13 +113,13 @@ def test_rates_are_log_linear_between_their_ends(scene):
 
 @pytest.mark.parametrize(("iterations", "every"), [(30_000, 1000), (3000, 100), (60, 2)])
 def test_one_degree_is_unlocked_every_thousand_iterations_of_thirty(scene, iterations, every):
-    trainer = Trainer(scene, small(iterations=iterations), "cpu")
+    trainer = nw.Trainer(scene, small(iterations=iterations), "cpu")
     degrees = {}
     for iteration in (1, every - 1, every, 2 * every - 1, 2 * every, 3 * every - 1, 3 * every, iterations):
         trainer.iteration = iteration
         degrees[iteration] = trainer.render_options().sh_degree
     assert degrees == {i: min(3, i // every) for i in degrees} and degrees[iterations] == 3
-    lower = Trainer(scene, small(iterations=iterations, sh_degree=1), "cpu")
+    lower = nw.Trainer(scene, small(iterations=iterations, sh_degree=1), "cpu")
     lower.iteration = iterations
     assert lower.render_options().sh_degree == 1 and lower.surfels.sh.shape[1] == 4
 
@@ -131,14 +129,14 @@ def test_one_degree_is_unlocked_every_thousand_iterations_of_thirty(scene, itera
     [(30_000, (500, 25_000, 100)), (3000, (50, 2500, 10)), (60_000, (1000, 50_000, 200)), (600, (10, 500, 10))],
 )
 def test_rounds_stretch_with_the_run(scene, iterations, rounds):
-    config = Trainer(scene, small(iterations=iterations, densify=DensifyConfig()), "cpu").densifier.config
+    config = nw.Trainer(scene, small(iterations=iterations, densify=DensifyConfig()), "cpu").densifier.config
     assert (config.start, config.stop, config.every) == rounds
 
 
 def test_surfels_settle_with_two_hits(scene):
     """Up to 25,000 of 30,000 iterations, a run with more is one with two; `more_hits_from` 0 has all from the start."""
     two, four, early = (
-        Trainer(scene, small(iterations=12, max_hits=hits, more_hits_from=start), "cpu")
+        nw.Trainer(scene, small(iterations=12, max_hits=hits, more_hits_from=start), "cpu")
         for hits, start in ((2, 25_000), (4, 25_000), (4, 0))
     )
     assert [t.render_options().max_hits for t in (two, four, early)] == [2, 2, 4]
@@ -151,7 +149,7 @@ def test_surfels_settle_with_two_hits(scene):
     assert not torch.equal(neural(four.texture).grid, neural(two.texture).grid)
     assert four.finish().options.max_hits == 4
     for hits in (0, 1):
-        assert Trainer(scene, small(iterations=12, max_hits=hits), "cpu").render_options().max_hits == hits
+        assert nw.Trainer(scene, small(iterations=12, max_hits=hits), "cpu").render_options().max_hits == hits
 
 
 @pytest.mark.parametrize("factor", [64.0, 1 / 64])
@@ -159,7 +157,7 @@ def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor):
     """By a power of two most roundings are the same, too; Adam carries on what others leave as it does gradients."""
     texture = dataclasses.replace(TEXTURE, min_resolution=None, max_resolution=None)
     config = small(iterations=40, texture=texture, densify=OFTEN)
-    runs = [Trainer(s, config, "cpu") for s in (scene, rescaled(scene, factor))]
+    runs = [nw.Trainer(s, config, "cpu") for s in (scene, rescaled(scene, factor))]
     for step in range(config.iterations):
         one, other = (torch.stack(list(trainer.step().losses.values())) for trainer in runs)
         assert_close(other, one, kind="gradient", name=f"losses of step {step}")

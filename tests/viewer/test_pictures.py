@@ -6,8 +6,6 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.model.exposures import Exposures
-from nexwarp.model.texture import DetailLimits
 from nexwarp.viewer.modes import BY_SLOT, MODES, TEXTURED, Picture, Settings, draw
 from nexwarp.viewer.world import Viewpoint, camera_to_world, vertical_fov
 from tests.scenes import make_surfels, make_texture, random_scene
@@ -40,7 +38,7 @@ def test_colour_modes_are_the_buffers(model, camera, mode):
 def test_colours_are_at_the_exposure_of_the_photos_or_the_mean(camera, falloff):
     model = nw.Model(make_surfels(random_scene(60, width=64, height=48)), make_texture(), options=OPTIONS)
     mean = {mode: drawn(model, [camera], Settings(mode)).pixels for mode in MODES}
-    model.exposures = Exposures.of(torch.tensor([[0.4, 0.0, -0.5]]), [camera], falloff)
+    model.exposures = nw.Exposures.of(torch.tensor([[0.4, 0.0, -0.5]]), [camera], falloff)
     for mode in MODES:
         exposed = drawn(model, [camera], Settings(mode)).pixels
         assert np.array_equal(exposed, mean[mode]) == (mode not in ("image", "plain", "textured")), mode
@@ -98,7 +96,7 @@ def test_bands_make_the_same_picture(model, camera, mode):
 def test_photo_detail_limits_the_texture_alone(model, camera):
     """Not the surfels, which are as wide as the picture's own pixels show them."""
     farthest = torch.full((len(model.surfels),), 3.5 / (3 * camera.focal))
-    limits = DetailLimits(torch.zeros_like(farthest), farthest)
+    limits = nw.DetailLimits(torch.zeros_like(farthest), farthest)
     model = nw.Model(model.surfels, model.texture, detail_limits=limits, options=OPTIONS)
     here = Viewpoint(camera_to_world(camera), vertical_fov(camera), 256, 192)
     free, limited = (here.bands(1.0, 0.01, model.surfels.means, focal_limit=f) for f in (math.inf, camera.focal))
