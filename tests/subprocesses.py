@@ -1,9 +1,20 @@
-"""Environments of the processes that tests start."""
+"""The processes that tests start: of this Python, which imports from this checkout first."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
+ROOT = Path(__file__).parents[1]
 
-def python_path(root: Path) -> dict[str, str]:
-    """Return the variable that lets a process import from a checkout first, then from wherever this one may."""
-    return {"PYTHONPATH": os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))}
+
+def environment(**changes: str) -> dict[str, str]:
+    """The variables of a process, some of them changed."""
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    return os.environ | {"PYTHONPATH": path} | changes
+
+
+def run_python(*arguments: object, timeout: float | None = None, **changes: str) -> subprocess.CompletedProcess[str]:
+    """Run Python to its end; what it prints is kept."""
+    words = [sys.executable, *map(str, arguments)]
+    return subprocess.run(words, cwd=ROOT, env=environment(**changes), capture_output=True, text=True, timeout=timeout)

@@ -13,9 +13,8 @@ import nexwarp
 from nexwarp.cli import display
 from nexwarp.cli import main as cli
 from tests.model_file_support import make_model
-from tests.subprocesses import python_path
+from tests.subprocesses import ROOT, environment, run_python
 
-ROOT = Path(__file__).parents[2]
 CLOSED_PIPE = 141
 
 
@@ -34,7 +33,7 @@ def test_a_closed_pipe_ends_without_a_traceback(arguments: list[str], capsys: py
 def run_closing(streams: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run a command from a shell that closes or redirects some of its streams."""
     command = ["sh", "-c", f'exec "$@" {streams}', "sh", sys.executable, "-m", "nexwarp", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, env=os.environ | python_path(ROOT), cwd=ROOT)
+    return subprocess.run(command, capture_output=True, text=True, env=environment(), cwd=ROOT)
 
 
 def test_finished_work_ends_well_without_a_stdout(tmp_path: Path) -> None:
@@ -50,7 +49,7 @@ def test_finished_work_ends_well_without_a_stdout(tmp_path: Path) -> None:
 
 def test_ctrl_c_while_libraries_load_prints_one_line() -> None:
     command = [sys.executable, "-m", "nexwarp", "info", "nowhere"]
-    started = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ | python_path(ROOT), cwd=ROOT)
+    started = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment(), cwd=ROOT)
     caught = 0
     while not caught & 1 << signal.SIGINT - 1:  # Python has begun
         caught = int(re.findall(r"SigCgt:\s*(\w+)", Path(f"/proc/{started.pid}/status").read_text())[0], 16)
@@ -90,5 +89,5 @@ def test_warp_starts_without_a_word(tmp_path: Path) -> None:
         K = torch.tensor([[9.0, 0, 4], [0, 9, 4], [0, 0, 1]])
         nw.render(surfels, None, nw.Camera(torch.eye(4), K, 8, 8))
     """
-    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True)
+    done = run_python("-c", textwrap.dedent(code))
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

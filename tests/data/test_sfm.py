@@ -1,6 +1,5 @@
 import dataclasses
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -27,9 +26,8 @@ from nexwarp.data.sfm.stages import Stages, exhaustive_pairs, sequential_pairs
 from nexwarp.errors import OutOfMemoryError, SceneError, StorageError
 from nexwarp.train import recipe
 from tests.cli.support import SMALL, refused, snapshot
-from tests.subprocesses import python_path
+from tests.subprocesses import environment, run_python
 
-ROOT = Path(__file__).parents[2]
 processing = sys.modules["nexwarp.data.sfm.process"]  # the package has a function of that name
 
 WIDTH, HEIGHT, FOCAL, VIEWS = 320, 240, 320.0, 7
@@ -585,8 +583,7 @@ def test_an_abort_is_one_line_and_leaves_nothing(fault, error, message, quick, t
 def test_a_limit_of_file_sizes_is_one_line_and_leaves_nothing(photos, tmp_path):
     code = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (99999, 99999)); "
     code += "from nexwarp.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "process", str(photos), str(tmp_path / "scene")]
-    done = subprocess.run(command, env=os.environ | python_path(ROOT), capture_output=True, text=True, timeout=120)
+    done = run_python("-c", code, "process", photos, tmp_path / "scene", timeout=120)
     told = f"nexwarp: error: {tmp_path / 'scene'}: cannot be written (File too large)\n"
     assert (done.returncode, done.stderr) == (2, told) and not list(tmp_path.iterdir())
 
@@ -594,7 +591,7 @@ def test_a_limit_of_file_sizes_is_one_line_and_leaves_nothing(photos, tmp_path):
 @pytest.mark.skipif(sys.platform == "win32", reason="a process group is ended there")
 def test_a_killed_process_leaves_nothing(photos, tmp_path):
     command = [sys.executable, "-m", "nexwarp", "process", str(photos), str(tmp_path / "scene")]
-    process = subprocess.Popen(command, env=os.environ | python_path(ROOT), stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, env=environment(), stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 60.0
     while not list(tmp_path.glob(".*/*/database.db")):
         assert process.poll() is None and time.monotonic() < deadline

@@ -1,7 +1,4 @@
 import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -16,7 +13,7 @@ from nexwarp.errors import DivergedError, FormatError, MissingError, NexwarpErro
 from nexwarp.run.folder import prepare_run, read_run
 from nexwarp.run.render import RenderOrder
 from nexwarp.train.checkpoint import load_checkpoint
-from tests.subprocesses import python_path
+from tests.subprocesses import run_python
 
 KIN = {
     ValueError: ("SettingError", "SceneError", "FormatError", "CheckpointError", "RunError"),
@@ -109,7 +106,6 @@ def wait(*_):
 cli.Info.__call__ = wait
 sys.exit(cli.main(["info", "run"]))
 """
-    environment = os.environ | python_path(Path(__file__).parents[2])
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
+    done = run_python("-c", program, timeout=120)
     assert done.returncode == 143 and done.stderr.splitlines()[-1] == "nexwarp: terminated"
     assert os.listdir(tmp_path) == []

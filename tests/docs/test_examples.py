@@ -1,7 +1,4 @@
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +10,8 @@ import nexwarp as nw
 from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.data import Scene
 from nexwarp.train.recipe import LearningRates, TextureConfig
-from tests.subprocesses import python_path
+from tests.subprocesses import ROOT, run_python
 
-ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 
@@ -37,9 +33,8 @@ def model(tiny_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(name: str, *arguments: object) -> str:
     """What an example prints; warnings are errors."""
-    command = [sys.executable, "-W", "error", str(ROOT / "examples" / f"{name}.py"), *map(str, arguments)]
-    environment = os.environ | python_path(ROOT) | {"CUDA_VISIBLE_DEVICES": ""}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    file = ROOT / "examples" / f"{name}.py"
+    done = run_python("-W", "error", file, *arguments, timeout=300, CUDA_VISIBLE_DEVICES="")
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -1,11 +1,10 @@
 """Data flows one way: a module may import only from layers below its own. And importing is cheap."""
 
 import ast
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
+
+from tests.subprocesses import run_python
 
 ROOT = Path(__file__).parents[2] / "nexwarp"
 # The one list of layers, from the top to the bottom, is in CONTRIBUTING.md.
@@ -79,12 +78,8 @@ def test_kernels_are_pure_warp() -> None:
 def test_import_is_quick_and_compiles_nothing(tmp_path: Path) -> None:
     """In the least of three fresh processes."""
     program = "import time, torch; start = time.process_time(); import nexwarp; print(time.process_time() - start)"
-    command = [sys.executable, "-c", program]
-    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path)}
-    seconds = []
-    for _ in range(3):
-        run = subprocess.run(command, env=environment, cwd=ROOT.parent, capture_output=True, text=True, check=True)
-        seconds.append(float(run.stdout.splitlines()[-1]))
+    runs = [run_python("-c", program, WARP_CACHE_PATH=str(tmp_path)) for _ in range(3)]
+    seconds = [float(run.stdout.splitlines()[-1]) for run in runs]
     assert min(seconds) <= 1.5, f"import nexwarp took {seconds} s beyond import torch"
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
@@ -106,6 +101,5 @@ print([name for name in sys.modules if name.startswith("torch._dynamo") or name.
 
 def test_training_and_loading_import_no_compiler_of_torch(tiny_folder: Path, tmp_path: Path) -> None:
     """It takes 0.6 to 1.2 s, at the start of every command."""
-    command = [sys.executable, "-c", USES, str(tiny_folder), str(tmp_path / "model")]
-    run = subprocess.run(command, cwd=ROOT.parent, capture_output=True, text=True, check=False)
+    run = run_python("-c", USES, tiny_folder, tmp_path / "model")
     assert run.stdout.splitlines()[-1:] == ["[]"], run.stdout + run.stderr

@@ -4,15 +4,12 @@ For sm_90 most of them; for sm_80 those whose atomics differ from sm_90's; all o
 """
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.compile_cuda import kernels
-
-ROOT = Path(__file__).parents[2]
+from tests.subprocesses import run_python
 
 
 @pytest.mark.long
@@ -25,8 +22,7 @@ ROOT = Path(__file__).parents[2]
     ],
 )
 def test_kernels_compile_for_cuda(arch: int, choice: str, least: int, tmp_path: Path) -> None:
-    command = [sys.executable, "-W", "error", "-m", "tests.compile_cuda", str(arch), choice, str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = run_python("-W", "error", "-m", "tests.compile_cuda", arch, choice, tmp_path)
     assert done.returncode == 0, done.stderr
     sizes = json.loads(done.stdout.splitlines()[-1])
     assert len(sizes) >= least

@@ -2,15 +2,11 @@
 
 import os
 import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
-from tests.subprocesses import python_path
+from tests.subprocesses import run_python
 
-ROOT = Path(__file__).parents[2]
 SECONDS = 60  # after which a child hangs
 
 PARENT = """
@@ -74,10 +70,7 @@ print("parent")
 
 
 def run(script: str) -> str:
-    environment = os.environ | python_path(ROOT)
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=3 * SECONDS
-    )
+    done = run_python("-c", script, timeout=3 * SECONDS)
     assert done.returncode == 0, done.stderr[-2000:]
     return done.stdout
 

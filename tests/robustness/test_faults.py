@@ -4,7 +4,6 @@ import errno
 import json
 import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -20,11 +19,10 @@ from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from tests.cli.support import refused, snapshot
 from tests.faults import Disk, failing
 from tests.scene_writers import write_demo
-from tests.subprocesses import python_path
+from tests.subprocesses import run_python
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 
-ROOT = Path(__file__).parents[2]
 # Nothing is written while exposures are estimated, SH smoothed and detail limits found, which would take most of such a
 # short training.
 SMALL = Config(
@@ -183,8 +181,7 @@ sys.exit(main(sys.argv[2:]))
 def test_a_file_that_grows_too_large_is_one_line_and_leaves_nothing_half(trained, tmp_path, arguments, size):
     run = Path(shutil.copytree(trained, tmp_path / "run"))
     words = [argument.format(run=run) for argument in arguments]
-    command = [sys.executable, "-c", LIMITED, str(size), *words, "--device", "cpu"]
-    done = subprocess.run(command, env=os.environ | python_path(ROOT), capture_output=True, text=True)
+    done = run_python("-c", LIMITED, size, *words, "--device", "cpu")
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
     assert done.stderr.startswith("nexwarp: error: ") and "cannot be written" in done.stderr
     check_whole(run)

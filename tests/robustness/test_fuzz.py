@@ -1,8 +1,6 @@
 """Every reader stands damaged files: a bounded run of `tests.robustness.fuzz`, and what its harness must notice."""
 
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,8 +10,8 @@ import pytest
 
 from tests.robustness.fuzz import Campaign
 from tests.robustness.fuzz_targets import TARGETS, FuzzTarget, write_input
+from tests.subprocesses import run_python
 
-ROOT = Path(__file__).parents[2]
 INPUTS = 80
 
 
@@ -28,8 +26,7 @@ def test_readers_load_or_refuse_in_one_line(tmp_path: Path, long: bool) -> None:
     """
     seconds, seed = os.environ.get("NEXWARP_FUZZ_SECONDS", "600"), os.environ.get("NEXWARP_FUZZ_SEED", "0")
     options = ["--seconds", seconds, "--seed", seed] if long else ["--seconds", "1200", "--inputs", str(INPUTS)]
-    command = [sys.executable, "-m", "tests.robustness.fuzz", *options, "--failed", str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = run_python("-m", "tests.robustness.fuzz", *options, "--failed", tmp_path)
     *lines, last = done.stdout.splitlines()
     assert done.returncode == 0 and " 0 failures," in last, done.stdout + done.stderr
     assert len(lines) == len(TARGETS)

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -16,11 +15,10 @@ from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.finish import FinishObserver
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from tests.scene_writers import expose_photos, write_demo
-from tests.subprocesses import python_path
+from tests.subprocesses import run_python
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 
-ROOT = Path(__file__).parents[2]
 FLAGS = ["--iterations", "20", "--max-surfels", "100", "--checkpoint-every", "1"]
 SMALL = Config(texture=TextureConfig(levels=4, table_size=2**10, width=16), densify=DensifyConfig(every=3))
 # When a kill comes: after so many steps, or views of a stage of the finishing, up to all training views.
@@ -72,8 +70,7 @@ def test_killed_runs_end_with_the_same_bytes(tmp_path: Path, device: str, count:
     for moment in MOMENTS[:count]:
         run = tmp_path / f"{moment[0]} {moment[1]}"
         call = (*moment, [*arguments, "--run", str(run)])
-        command = [sys.executable, "-c", f"from tests.robustness.test_kills import main; main(*{call})"]
-        done = subprocess.run(command, env=os.environ | python_path(ROOT), capture_output=True)
+        done = run_python("-c", f"from tests.robustness.test_kills import main; main(*{call})")
         assert done.returncode == -signal.SIGKILL, (moment, done.stderr)
         assert not (run / MODEL_FILE).exists() and has_checkpoint(run), moment
         assert cli.main(["train", str(scene), "--run", str(run), "--device", device, "--resume"]) == 0, moment

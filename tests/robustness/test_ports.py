@@ -1,7 +1,6 @@
 """Which ports commands open: nothing listens beyond loopback but what was asked for."""
 
 import ipaddress
-import os
 import signal
 import subprocess
 import sys
@@ -12,9 +11,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.subprocesses import python_path
+from tests.subprocesses import ROOT, environment
 
-ROOT = Path(__file__).parents[2]
 SMALL = ["texture.levels=2", "texture.table_size=256", "exposures=false", "smooth_sh=0", "footprints=false"]
 
 Place = tuple[str, int]  # address and port
@@ -31,10 +29,9 @@ def listening(command: psutil.Process) -> set[Place]:
 
 def places_until(text: str, arguments: list[str], log: Path) -> set[Place]:
     """Run a command until it has printed a text, then end it; return all places at which it has listened."""
-    environment = os.environ | python_path(ROOT) | {"OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "nexwarp", *arguments]
     with log.open("w") as file:
-        started = subprocess.Popen(command, env=environment, stdout=file, stderr=file, cwd=ROOT)
+        started = subprocess.Popen(command, env=environment(OMP_NUM_THREADS="1"), stdout=file, stderr=file, cwd=ROOT)
     places, until = set[Place](), time.monotonic() + 180
     try:
         while text not in log.read_text():

@@ -13,9 +13,7 @@ import pytest
 from nexwarp.cli import main as cli
 from nexwarp.errors import RunError, StorageError
 from nexwarp.run.folder import locked_run
-from tests.subprocesses import python_path
-
-ROOT = Path(__file__).parents[2]
+from tests.subprocesses import environment
 
 HOLD = """
 import os, sys, time
@@ -33,9 +31,8 @@ with locked_run(Path(sys.argv[1])):
 def holder(tmp_path_factory) -> Iterator[tuple[Path, subprocess.Popen[str], int]]:
     """A run folder, the process that holds its lock, and a child that it has forked meanwhile."""
     run = tmp_path_factory.mktemp("held") / "run"
-    environment = os.environ | python_path(ROOT)
     command = [sys.executable, "-W", "ignore", "-c", HOLD, str(run)]
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, env=environment(), stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         child = int(process.stdout.readline())
         try:

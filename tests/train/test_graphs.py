@@ -1,6 +1,4 @@
 import dataclasses
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +12,7 @@ from nexwarp import ops
 from nexwarp.model import graphs as step_graphs
 from nexwarp.train import target as training_views
 from nexwarp.train.recipe import Config, DensifyConfig, with_settings
+from tests.subprocesses import run_python
 from tests.trainer_support import TEXTURE, assert_same_state
 
 pytestmark = pytest.mark.cuda
@@ -144,7 +143,7 @@ def test_a_first_training_in_a_process(tiny_folder: Path) -> None:
         "    captured += sum(stage.captured is not None for stage in trainer.graphs.stages.values())\n"
         "assert captured\n"
     )
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
+    done = run_python("-W", "error", "-c", code)
     assert done.returncode == 0, done.stderr
 
 

@@ -1,15 +1,13 @@
 """Freed memory stays with a process that renders on a CPU, large blocks too, unless the environment says otherwise."""
 
-import os
-import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.subprocesses import python_path
+from tests.subprocesses import run_python
 
-ROOT = Path(__file__).parents[2]
 # Blocks as large as those of a frame of 480x320, which glibc maps anew each time, and the fewest page faults of one: a
 # kept block may have been taken in part by a small one, so that the next large one is new.
 SCRIPT = """
@@ -35,6 +33,6 @@ def huge_pages() -> bool:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only glibc is told to keep memory")
 @pytest.mark.parametrize(("value", "kept"), [(None, True), ("0", False)])
 def test_large_blocks_are_not_mapped_anew(value: str | None, kept: bool) -> None:
-    environment = os.environ | python_path(ROOT) | ({} if value is None else {"NEXWARP_KEEP_MEMORY": value})
-    done = subprocess.run([sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=True)
+    changes: dict[str, Any] = {} if value is None else {"NEXWARP_KEEP_MEMORY": value}
+    done = run_python("-c", SCRIPT, **changes)
     assert (int(done.stdout) < 2000) == (kept or huge_pages())  # of 19,532 pages

@@ -12,11 +12,10 @@ import pytest
 
 from nexwarp.model.model_file import MODEL_FILE
 from nexwarp.train.checkpoint import has_checkpoint, load_checkpoint
-from tests.subprocesses import python_path
+from tests.subprocesses import ROOT, environment
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 
-ROOT = Path(__file__).parents[2]
 SMALL = "texture.levels=4 texture.table_size=1024 texture.width=16 densify.every=300".split()
 TRAIN = ["--device", "cpu", "--max-surfels", "200", *(x for s in SMALL for x in ("--set", s))]
 TORCHRUN = ["-m", "torch.distributed.run", "--rdzv-backend=c10d", "--rdzv-endpoint=localhost:0"]
@@ -27,10 +26,8 @@ MODULE = ["-m", "--"]
 
 def start(arguments: list[str], launcher: list[str] | None = None) -> subprocess.Popen[str]:
     command = [sys.executable, *(launcher or ["-m"]), "nexwarp", *arguments]
-    environment = os.environ | python_path(ROOT) | {"OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=ROOT
-    )
+    variables, nowhere = environment(OMP_NUM_THREADS="1"), subprocess.DEVNULL
+    return subprocess.Popen(command, env=variables, stdout=nowhere, stderr=subprocess.PIPE, text=True, cwd=ROOT)
 
 
 def lines(process: subprocess.Popen[str], seconds: float = 600) -> list[str]:

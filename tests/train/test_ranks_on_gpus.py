@@ -1,16 +1,14 @@
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.subprocesses import python_path
-from tests.train.test_ranks_command import ROOT, TORCHRUN, await_checkpoint, lines, ranks_of, start
+from tests.subprocesses import run_python
+from tests.train.test_ranks_command import TORCHRUN, await_checkpoint, lines, ranks_of, start
 
 pytestmark = [pytest.mark.cuda, pytest.mark.timeout(300)]
 
@@ -24,15 +22,8 @@ TWO_GPUS = pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two G
 )
 def test_all_ways_of_a_step_give_the_same_bits(tiny_folder: Path, backend: str, ranks: int) -> None:
     """With `deterministic`: gradients summed in the graph, after it, or without one; on all ranks."""
-    command = [sys.executable, *TORCHRUN, f"--nproc-per-node={ranks}", "-m", "tests.ranks_on_gpus"]
-    run = subprocess.run(
-        [*command, str(tiny_folder), backend, "240", "400"],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env=os.environ | python_path(ROOT),
-        timeout=280,
-    )
+    command = [*TORCHRUN, f"--nproc-per-node={ranks}", "-m", "tests.ranks_on_gpus", tiny_folder, backend, 240, 400]
+    run = run_python(*command, timeout=280)
     assert run.returncode == 0, run.stderr[-2000:]
     told = [json.loads(line) for line in run.stdout.splitlines() if line.startswith("{")]
     modes = ["eager", "captured", "beside"] if backend == "nccl" else ["eager", "beside"]
