@@ -52,7 +52,8 @@ def test_masked_pixels_have_no_depth(mapped: nw.Scene, mode: str) -> None:
     view = mapped.train[1]
     mask = torch.rand(view.image.shape[:2]) < 0.5
     scene = dataclasses.replace(mapped, train=[dataclasses.replace(view, mask=mask), *mapped.train[2:]])
-    depth = nw.Trainer(scene, small(mask_mode=mode), "cpu").targets.make(0, 1, []).depth
+    trainer = nw.Trainer(scene, small(mask_mode=mode), "cpu")
+    depth = trainer.targets.make(0, 1, []).depth
     assert torch.equal(present(depth), 3.0 * mask)
 
 
