@@ -48,8 +48,7 @@ def loss(out: Any) -> torch.Tensor:
     total = out.image.new_zeros(())
     for name in BUFFERS:
         buffer = getattr(out, name)
-        factors = torch.randn(buffer.shape, generator=generator, dtype=torch.float64)
-        total = total + (buffer * factors.to(buffer)).sum()
+        total = total + (buffer * torch.randn(buffer.shape, generator=generator, dtype=torch.float64).to(buffer)).sum()
     return total
 
 

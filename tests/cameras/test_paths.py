@@ -105,8 +105,7 @@ def test_up_is_across_the_right_axes_however_cameras_are_tilted() -> None:
     mean = -torch.stack([each.viewmat[1, :3] for each in tilted]).mean(0)
     assert mean @ UP / mean.norm() < math.cos(math.radians(10.0))
     for motion in (similarity(1.0), similarity(3.0)):
-        up = up_direction([moved(each, motion) for each in tilted])
-        assert up @ (motion[0] @ UP) > math.cos(math.radians(1.0))
+        assert up_direction([moved(each, motion) for each in tilted]) @ (motion[0] @ UP) > math.cos(math.radians(1.0))
     # Of cameras that all look one way, the right axes say nothing about the tilt: the mean of their own directions.
     alike = [camera(torch.tensor([x, 0.0, 0.0]), torch.tensor([x, 4.0, 0.0])) for x in (-1.0, 0.0, 1.0)]
     assert up_direction(alike) @ UP > 1 - 1e-9 and up_direction([]).tolist() == [0.0, -1.0, 0.0]
@@ -137,8 +136,7 @@ PATHS = pytest.mark.parametrize(("make", "cameras_of"), [(ellipse, ring), (inter
 def test_paths_move_and_scale_with_the_cameras(make, cameras_of, scale: float) -> None:
     cameras, motion = cameras_of(), similarity(scale)
     expected = [moved(each, motion) for each in make(cameras, 23)]
-    actual = make([moved(each, motion) for each in cameras], 23)
-    for mine, theirs in zip(actual, expected, strict=True):
+    for mine, theirs in zip(make([moved(each, motion) for each in cameras], 23), expected, strict=True):
         assert (mine.viewmat - theirs.viewmat).abs().max() < 1e-7 * max(scale, 1.0)
 
 

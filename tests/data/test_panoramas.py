@@ -54,8 +54,7 @@ def room(walls: np.ndarray, position: np.ndarray, directions: np.ndarray) -> np.
     hits = position + np.take_along_axis(distances, axis[..., None], -1) * directions
     side = 2 * axis + (np.take_along_axis(directions, axis[..., None], -1)[..., 0] > 0)
     place = [np.take_along_axis(hits, ((axis + k) % 3)[..., None], -1)[..., 0] for k in (1, 2)]
-    texels = [(p / ROOM + 1) / 2 * (TEXELS - 1) for p in place]
-    grey = map_coordinates(walls, [side, *texels], order=1, mode="nearest")
+    grey = map_coordinates(walls, [side, *[(p / ROOM + 1) / 2 * (TEXELS - 1) for p in place]], order=1, mode="nearest")
     return np.repeat(grey.round().astype(np.uint8)[..., None], 3, axis=-1)
 
 

@@ -43,8 +43,7 @@ def test_contradicting_pairs_are_grouped_by_their_two_sides() -> None:
     pairs = {("a1", "b1"): 50, ("a2", "b1"): 40, ("b2", "a1"): 30, ("a2", "b2"): 20, ("c", "d"): 10}
     first, second = grouped(pairs)
     assert {tuple(first.photos), tuple(first.others)} == {("a1", "a2"), ("b1", "b2")}
-    assert (first.pairs, first.matches) == (4, 140) and (second.pairs, second.matches) == (1, 10)
-    assert grouped({}) == []
+    assert (first.pairs, first.matches) == (4, 140) and (second.pairs, second.matches) == (1, 10) and grouped({}) == []
 
 
 def test_models_are_reported_with_what_links_them() -> None:

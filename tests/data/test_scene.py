@@ -174,8 +174,7 @@ def test_downscale_scales_pixels_and_keeps_areas(tmp_path, downscale):
     full, small = load_scene(path), load_scene(path, downscale=downscale)
     for one, other in zip(views_of(full), views_of(small), strict=True):
         rows, columns = HEIGHT // downscale, WIDTH // downscale
-        assert other.image.shape == (rows, columns, 3)
-        assert (other.camera.width, other.camera.height) == (columns, rows)
+        assert other.image.shape == (rows, columns, 3) and (other.camera.width, other.camera.height) == (columns, rows)
         torch.testing.assert_close(
             project(other.camera, full.points), project(one.camera, full.points) / downscale, rtol=0, atol=1e-5
         )

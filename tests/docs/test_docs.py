@@ -216,8 +216,7 @@ def api_page() -> str:
         texts.append(f"## {title}\n")
         for name in sorted(nw.__all__, key=str.lower):
             made = getattr(nw, name)
-            module = made.__name__ if inspect.ismodule(made) else made.__module__
-            if module.split(".")[1] in rooms:
+            if (made.__name__ if inspect.ismodule(made) else made.__module__).split(".")[1] in rooms:
                 doc = inspect.getdoc(made) or ""
                 table.append(f"| [`{name}`](#{name.lower()}) | {cell(doc.splitlines()[0])} |")
                 texts += [f"### {name}\n", *section_of(made, name)]

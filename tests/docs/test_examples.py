@@ -33,8 +33,7 @@ def model(tiny_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(name: str, *arguments: object) -> str:
     """What an example prints; warnings are errors."""
-    file = ROOT / "examples" / f"{name}.py"
-    done = run_python("-W", "error", file, *arguments, timeout=300, CUDA_VISIBLE_DEVICES="")
+    done = run_python("-W", "error", ROOT / "examples" / f"{name}.py", *arguments, timeout=300, CUDA_VISIBLE_DEVICES="")
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -185,8 +185,7 @@ def test_cards_of_a_bright_scene_are_dimmed_not_clipped(baked, cameras, tmp_path
     assert 0.001 < float((opaque == 1).double().mean()) < 0.021
     assert_close(bright.texels, once.texels, kind="value", name="texels")
     unexposed = dataclasses.replace(baked.model.options, exposure="mean")
-    model = nw.Model(baked.surfels, None, baked.model.exposures, None, unexposed)
-    assert dimmed(model, torch.full((5, 3), 3.0)) == 1
+    assert dimmed(nw.Model(baked.surfels, None, baked.model.exposures, None, unexposed), torch.full((5, 3), 3.0)) == 1
     save_glb(tmp_path / "a.glb", bright, list(cameras.values()))
     read = nw.load_baked(tmp_path / "a.glb")
     assert read.exposure == bright.exposure

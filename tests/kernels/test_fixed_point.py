@@ -26,8 +26,7 @@ def summed(terms: torch.Tensor, order: torch.Tensor) -> torch.Tensor:
 
 def test_order_does_not_matter() -> None:
     """Terms over 20 decades, with cancellation: float sums differ with the order, these do not."""
-    size = torch.linspace(-14, 5, 4000, dtype=torch.float64)
-    terms = (10.0**size * torch.randn(4000, dtype=torch.float64)).float()
+    terms = (10.0 ** torch.linspace(-14, 5, 4000, dtype=torch.float64) * torch.randn(4000, dtype=torch.float64)).float()
     orders = [torch.arange(4000), torch.arange(3999, -1, -1), torch.randperm(4000)]
     floats = {np.add.accumulate(terms[order].numpy(), dtype=np.float32)[-1].item() for order in orders}
     values = [summed(terms, order) for order in orders]

@@ -102,8 +102,7 @@ def test_bad_surfels(argument: str, error: type[Exception], spoil: Callable[[Any
 def test_surfels_are_fresh_leaves() -> None:
     scene = random_scene(8)
     scene["means"].requires_grad_()
-    surfels = make_surfels(scene)
-    for name, parameter in surfels.named_parameters():
+    for name, parameter in make_surfels(scene).named_parameters():
         assert parameter.is_leaf and parameter.requires_grad, name
         assert all(parameter.data_ptr() != scene[key].data_ptr() for key in SURFEL_KEYS if scene[key].numel())
 

@@ -100,8 +100,7 @@ def test_planted_floaters_go_and_the_rest_stays():
     model = sphere_model(shares[:, None] * 4 * spread(40), torch.tensor([0.05] * 30 + [0.9] * 10))
     stages = []
     found = find_floaters(model, cameras, lambda *stage: stages.append(stage))
-    assert found[600:].all() and found[:600].sum() <= 0.005 * 600
-    assert len(stages) == 80 and stages[-1][1:] == (40, 40)
+    assert found[600:].all() and found[:600].sum() <= 0.005 * 600 and len(stages) == 80 and stages[-1][1:] == (40, 40)
     assert not find_floaters(select(model, ~found), cameras).any(), "they go at once"
     kept = kept_surfels(model.surfels, [Edit("remove", (checksum(model.surfels), *found.nonzero()[:, 0].tolist()))])
     assert (kept == ~found.numpy()).all()

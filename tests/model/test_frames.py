@@ -63,8 +63,7 @@ def test_a_cpu_has_no_graphs() -> None:
     model = finished("cpu")
     with torch.no_grad():
         outs = [model.render(camera) for camera in cameras("cpu") for _ in range(3)]
-    assert model.surfels not in frames._graphs
-    assert not any(isinstance(out, frames.CapturedRendering) for out in outs)
+    assert model.surfels not in frames._graphs and not any(isinstance(out, frames.CapturedRendering) for out in outs)
 
 
 @CUDA

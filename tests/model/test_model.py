@@ -109,8 +109,7 @@ def test_changes_are_options_of_one_rendering(device: torch.device) -> None:
     model, camera = full_model(device), cameras_of(device)[0]
     before = model.options
     out = model.render(camera, max_hits=0, background=(1.0, 0.0, 0.0), sh_degree=0, exposure="mean")
-    options = nw.RenderOptions(0, (1.0, 0.0, 0.0), 0)
-    expected = draw(model.surfels, None, camera, options, limits=model.detail_limits)
+    expected = draw(model.surfels, None, camera, nw.RenderOptions(0, (1.0, 0.0, 0.0), 0), limits=model.detail_limits)
     assert_same(out, expected)
     assert model.options is before
     red = model.render(camera, background=torch.tensor([1.0, 0.0, 0.0], device=device), exposure="mean").image
@@ -152,8 +151,7 @@ def test_rendering_changes_nothing(device: torch.device) -> None:
     first = model.render(cameras)
     render_buffers(model, cameras[0])
     model.render(cameras[1], exposure="mean", detail_limits=False, max_hits=0)
-    again = model.render(cameras)
-    for one, other in zip(first, again, strict=True):
+    for one, other in zip(first, model.render(cameras), strict=True):
         assert_same(one, other)
     assert all(vars(model)["_modules"][name] is part for name, part in parts.items())
     assert model.options is OPTIONS and all(parameter.grad is None for parameter in model.parameters())

@@ -29,8 +29,7 @@ def test_the_order_of_the_surfels_changes_nothing(device: torch.device) -> None:
 
 def test_moving_scene_and_camera_together_changes_nothing(device: torch.device) -> None:
     scene = random_scene(sh_degree=0, dtype=torch.float64, device=device)
-    moved = moved_scene(scene, (0.3, -0.7, 0.4, 0.5), (3.0, -1.0, 2.0))
-    assert_alike(draw(moved, max_hits=4), draw(scene, max_hits=4))
+    assert_alike(draw(moved_scene(scene, (0.3, -0.7, 0.4, 0.5), (3.0, -1.0, 2.0)), max_hits=4), draw(scene, max_hits=4))
 
 
 def test_scaling_the_world_scales_depths_only(device: torch.device) -> None:

@@ -61,8 +61,7 @@ def test_basis_is_the_real_form_of_scipys() -> None:
     for degree in range(MAX_SH_DEGREE + 1):
         for order in range(-degree, degree + 1):
             values = scipy.special.sph_harm_y(degree, abs(order), polar.numpy(), azimuth.numpy())
-            part = values.imag if order < 0 else values.real
-            columns.append(torch.as_tensor(part) * (math.sqrt(2) if order else 1))
+            columns.append(torch.as_tensor(values.imag if order < 0 else values.real) * (math.sqrt(2) if order else 1))
     assert_close(basis(directions, MAX_SH_DEGREE), torch.stack(columns, dim=-1), kind="value", name="basis")
 
 

@@ -50,8 +50,7 @@ def test_surface_agrees_with_the_reference(dtype: torch.dtype, name: str, device
     assert expected.expected_depth.any() and (name != "specks" or not expected.expected_depth.all())
     flips = 0.0 if dtype == torch.float64 else FLIPS
     for buffer in BUFFERS:
-        values = getattr(out, buffer), getattr(expected, buffer)
-        assert_close(*values, kind="value", name=buffer, allow_flips=flips)
+        assert_close(*(getattr(out, buffer), getattr(expected, buffer)), kind="value", name=buffer, allow_flips=flips)
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -203,8 +203,7 @@ def _values(rng: random.Random, header: dict[str, Any], body: bytes) -> bytes:
         elif abs(value) > largest and value == value:
             value = float("inf") if value > 0 else -float("inf")
         count = (end - first) // size
-        places = range(count) if rng.random() < 0.1 else [rng.randrange(count)]
-        for place in places:
+        for place in range(count) if rng.random() < 0.1 else [rng.randrange(count)]:
             at = first + place * size
             body = body[:at] + struct.pack(code, value) + body[at + size :]
     return body

@@ -180,8 +180,7 @@ sys.exit(main(sys.argv[2:]))
 )
 def test_a_file_that_grows_too_large_is_one_line_and_leaves_nothing_half(trained, tmp_path, arguments, size):
     run = Path(shutil.copytree(trained, tmp_path / "run"))
-    words = [argument.format(run=run) for argument in arguments]
-    done = run_python("-c", LIMITED, size, *words, "--device", "cpu")
+    done = run_python("-c", LIMITED, size, *[argument.format(run=run) for argument in arguments], "--device", "cpu")
     assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
     assert done.stderr.startswith("nexwarp: error: ") and "cannot be written" in done.stderr
     check_whole(run)

@@ -208,8 +208,7 @@ def _surviving(versions: list[bytes], chance: random.Random) -> bytes:
         return versions[i]
     old, new = versions[i], versions[i + 1]
     place = chance.randint(0, len(new))
-    rest = chance.choice((b"", bytes(len(new) - place), old[place:]))
-    return chance.choice((new[:place] + rest, bytes(len(new))))
+    return chance.choice((new[:place] + chance.choice((b"", bytes(len(new) - place), old[place:])), bytes(len(new))))
 
 
 def found_in(root: Path) -> list[Any]:

@@ -70,8 +70,7 @@ def test_metrics_do_not_see_below_8_bits(metric: Callable[..., float]) -> None:
     shaken = exact + 0.45 / 255 * (2 * torch.rand(exact.shape).double() - 1)
     assert metric(shaken, target) == metric(image, target) == metric(exact.float(), target.float() / 255)
     assert metric(exact * 3 - 1, target) == metric((exact * 3 - 1).clamp(0, 1), target)
-    mirrored = [picture.flip(1) for picture in (image, target)]
-    assert metric(*mirrored) == pytest.approx(metric(image, target), abs=1e-5)
+    assert metric(*[picture.flip(1) for picture in (image, target)]) == pytest.approx(metric(image, target), abs=1e-5)
 
 
 def test_to_uint8_rounds_and_clamps() -> None:

@@ -142,8 +142,7 @@ def test_each_epoch_sees_each_view_once(scene: nw.Scene) -> None:
             chosen = [cast(int, trainer._next_target()) for trainer in trainers]
             for offset in range(trainers[0].views_a_step):
                 taken.setdefault(first + offset, []).append(chosen[offset])
-        weights = [trainer.share for trainer in trainers]
-        assert sum(weights) == pytest.approx(1.0) and trainers[0].iteration == 3 * views
+        assert sum([trainer.share for trainer in trainers]) == pytest.approx(1.0) and trainers[0].iteration == 3 * views
     order = [taken[number] for number in sorted(taken)]
     assert sorted(taken) == list(range(3 * views))
     assert all(len(set(each)) == 1 for each in order)  # all sizes agree
@@ -267,6 +266,5 @@ def test_many_gradients_are_summed_after_the_graph() -> None:
     most = (MOST_CAPTURED_BYTES // 4 - ours) // 60
     for count, beside in ((most, False), (most + 1, True)):
         config = Config(max_surfels=count)
-        assert sums_beside("nccl", surfels, texture, config) is beside
-        assert sums_beside("gloo", surfels, texture, config)
+        assert sums_beside("nccl", surfels, texture, config) is beside and sums_beside("gloo", surfels, texture, config)
     assert not sums_beside("nccl", surfels, texture, Config(max_surfels=most + 1, max_hits=0))

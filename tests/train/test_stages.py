@@ -167,8 +167,7 @@ def test_fast_runs_are_shortened_in_python_and_by_the_command(
     photos = len(tiny_scene.train)
     assert photos < CONFIG.iterations
     steps: list[nw.StepReport] = []
-    config = dataclasses.replace(CONFIG, steps_a_photo=1, teachers=0)
-    nw.train(tiny_scene, config, device=CPU, callbacks=[steps.append])
+    nw.train(tiny_scene, dataclasses.replace(CONFIG, steps_a_photo=1, teachers=0), device=CPU, callbacks=[steps.append])
     assert len(steps) == photos
     run = tmp_path / "run"
     command = ["train", str(tiny_folder), "--run", str(run), "--preset", "fast", *SMALL]

@@ -18,8 +18,7 @@ def model() -> nw.Model:
 
 @pytest.fixture(scope="module")
 def camera() -> nw.Camera:
-    scene = random_scene(1)
-    return make_camera(scene | {"K": intrinsics(48.0, 48.0, 32.0, 24.0).float(), "width": 64, "height": 48})
+    return make_camera(random_scene(1) | {"K": intrinsics(48.0, 48.0, 32.0, 24.0).float(), "width": 64, "height": 48})
 
 
 @pytest.fixture(scope="module")

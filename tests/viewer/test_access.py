@@ -106,8 +106,7 @@ def test_pages_of_other_servers_are_refused(model, host):
         path = urlsplit(viewer.url)._replace(scheme="", netloc="").geturl() or "/"
         status, _, text = get(viewer, path, Origin="null")
         assert status == 403 and "page of another server" in text and not viewer.sessions
-        own = viewer.url.partition("/?")[0]
-        with Client(viewer, origin=own) as client:
+        with Client(viewer, origin=viewer.url.partition("/?")[0]) as client:
             client.look()
             assert client.picture().ndim == 3
         if host != "0":
