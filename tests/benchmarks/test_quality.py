@@ -55,7 +55,6 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
 
 
 def test_the_documents_have_the_kept_figures(tmp_path: Path) -> None:
-    """The pages are what `publish` makes of the kept results."""
     results = ROOT / "benchmarks" / "results" / "quality.jsonl"
     for name in ("README.md", "docs/quality.md"):
         page = tmp_path / Path(name).name

@@ -67,7 +67,6 @@ def test_no_cuda_when_asked_for(scene, finished, refuses, capsys):
     ],
 )
 def test_a_missing_package_is_one_line(finished, tmp_path, monkeypatch, capsys, package, words, command):
-    """Before anything is read or written."""
     find = importlib.util.find_spec
     monkeypatch.setattr("importlib.util.find_spec", lambda name, *a: None if name == package else find(name, *a))
     monkeypatch.setitem(sys.modules, package, None)

@@ -62,7 +62,6 @@ def test_a_levelled_and_scaled_run_looks_the_same_from_the_moved_cameras(finishe
 
 
 def test_the_ground_of_a_tilted_scene_becomes_y_0(tmp_path):
-    """Things stand on it, and a few large surfels lie below it."""
     turn = rigid((0.3, 0.8, -0.4, 0.2), (1, 2, 3))
     floor = torch.cat([4 * torch.rand(300, 2) - 2, torch.zeros(300, 1)], 1)
     things = torch.cat([torch.rand(80, 2), 0.2 + torch.rand(80, 1)], 1)
@@ -223,7 +222,6 @@ def test_damaged_edits_are_named_by_every_command(finished, capsys):
 
 
 def test_baked_exports_move_too(finished, monkeypatch):
-    """Cards, and their pictures from the moved cameras."""
     pytest.importorskip("trimesh")
     monkeypatch.setattr("nexwarp.export.fit.FEWEST_STEPS", 2)
     monkeypatch.setattr("nexwarp.export.glb.CUTOFF", 0.05)  # surfels of a short training are faint

@@ -171,7 +171,6 @@ def baked_files(run: Path, path: str | None = None, finetune: bool = True) -> tu
 
 
 def test_an_export_learns_from_training_photos_alone(finished, tmp_path):
-    """And tells the PSNR of what was written on the test photos."""
     source = present(open_model(finished).source)
     results = {"as it is": baked_files(finished)}
     figures = read(finished / "page", "metrics.json")["exports"]["index.html"]

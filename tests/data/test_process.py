@@ -142,7 +142,6 @@ def test_bad_videos_are_one_line_and_leave_nothing(tmp_path: Path, capsys: pytes
 
 @pytest.mark.slow
 def test_a_clip_becomes_a_scene(tmp_path: Path) -> None:
-    """Nine tenths of the frames kept are registered."""
     report = process(Path(__file__).parent / "photos" / "walk.mp4", tmp_path / "scene", 12)
     assert report.frames is not None and len(report.registered) >= 0.9 * len(report.frames.chosen) >= 0.9 * 12
     scene = load_scene(tmp_path / "scene")

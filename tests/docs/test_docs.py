@@ -297,7 +297,6 @@ def test_the_site_builds(tmp_path):
 
 
 def test_links():
-    """Every link from one document to another leads somewhere."""
     for page in PAGES:
         for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"

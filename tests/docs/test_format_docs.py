@@ -179,7 +179,6 @@ def test_the_python_of_paper_and_migrating_runs(execute, run, capsys):
 
 
 def test_the_readme_s_python_runs(execute, capsys):
-    """As it stands, where a run of the demo is."""
     (names,) = execute("README.md")
     assert names["lines"] <= 12
     shapes = "torch.Size([36, 48, 3]) torch.Size([36, 48]) torch.Size([36, 48, 3]) torch.Size([36, 48])"
@@ -187,6 +186,5 @@ def test_the_readme_s_python_runs(execute, capsys):
 
 
 def test_the_depth_page_s_python_runs(execute):
-    """It reads what its command writes."""
     assert cli.main(["render", "runs/demo", "--set", "test", "--buffers"]) == 0
     assert len(execute("docs/depth.md")) == 1

@@ -76,7 +76,6 @@ def test_kernels_are_pure_warp() -> None:
 
 
 def test_import_is_quick_and_compiles_nothing(tmp_path: Path) -> None:
-    """In the least of three fresh processes."""
     program = "import time, torch; start = time.process_time(); import nexwarp; print(time.process_time() - start)"
     runs = [run_python("-c", program, WARP_CACHE_PATH=str(tmp_path)) for _ in range(3)]
     seconds = [float(run.stdout.splitlines()[-1]) for run in runs]

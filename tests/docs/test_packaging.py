@@ -41,7 +41,6 @@ def script(name: str) -> Any:
 
 
 def test_an_editable_package_is_found_in_the_folder_above_the_clone(tmp_path: Path) -> None:
-    """The clone's folder is named as the package."""
     pytest.importorskip("setuptools", reason="needs setuptools (extra dev)")
     clone, site = tmp_path / "nexwarp", tmp_path / "site"
     (clone / "nexwarp").mkdir(parents=True)

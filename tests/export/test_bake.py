@@ -139,7 +139,6 @@ def test_the_gltf_file_holds_the_surfels(baked, cameras, tmp_path):
 
 @pytest.mark.parametrize("unit", [1.0, 1e-3, 3e4])
 def test_spz_files_hold_the_gaussians(model, tmp_path, unit):
-    """In scenes of any size."""
     library = pytest.importorskip("gaussforge").GaussForge()
     surfels = copy.deepcopy(model.surfels)
     with torch.no_grad():

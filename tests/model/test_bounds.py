@@ -89,7 +89,6 @@ def check_message(error: Exception, file: Path, name: str) -> None:
 @pytest.mark.parametrize("value", VALUES)
 @pytest.mark.parametrize("name", TENSORS)
 def test_a_number_is_refused_or_renders_finite(stored, tmp_path, device, name, value):
-    """On CUDA, the texture is computed in half precision."""
     file = tmp_path / "model.safetensors"
     file.write_bytes(with_number(stored.read_bytes(), name, value))
     try:

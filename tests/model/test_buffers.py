@@ -54,7 +54,6 @@ def test_file_reads_back_bit_for_bit(tmp_path: Path, max_hits: int) -> None:
 
 
 def test_file_holds_named_channels(tmp_path: Path) -> None:
-    """As any OpenEXR reader sees it."""
     import numpy as np
     import OpenEXR
 

@@ -318,7 +318,6 @@ def test_predicted_gains_stay_within_those_of_the_photos() -> None:
 
 @pytest.mark.parametrize("count", [0, 1001])
 def test_exposures_of_too_few_and_too_many_photos_are_refused(tmp_path: Path, count: int) -> None:
-    """In files, too: `Exposures` is what reads them."""
     with pytest.raises(ValueError, match=f"exposures: expected 1 to 1,000 photos, got {count:,}"):
         make_exposures(count)
     model = nw.Model(make_surfels(random_scene(3)), None, make_exposures(2))

@@ -55,7 +55,6 @@ def test_widening_is_what_torch_gives(dtype: torch.dtype, device: torch.device) 
 
 
 def test_widening_of_extremes_is_finite(device: torch.device) -> None:
-    """And what is far larger than a pixel stays as it is."""
     shape, farthest = arguments(8, torch.float32, device)
     with torch.no_grad():
         shape[0].fill_(1e4)

@@ -115,7 +115,6 @@ def test_a_camera_inside_surfels_is_finite(scale: float, near: float, device: to
 
 
 def test_a_surfel_around_the_camera_is_seen_only_beyond_near(device: torch.device) -> None:
-    """The camera sits in a sheet, or before it by less than near."""
     for depth, near, seen in ((0.0, 0.01, False), (0.005, 0.01, False), (0.005, 0.0, True), (0.02, 0.01, True)):
         out = check_finite(facing(device, means=(0.0, 0.0, depth), scales=1e3) | {"near": near})
         assert_close(out.alpha, torch.full((16, 16), 0.9 if seen else 0.0), kind="value", name=f"alpha at {depth}")
@@ -144,7 +143,6 @@ def test_extremes_among_others_leave_those_as_they_are(scales: float, opacity: f
 
 @pytest.mark.parametrize(("width", "height"), [(16, 16), (1, 1), (SIDE, 1), (1, SIDE), (SIDE, 8)])
 def test_images_of_any_size(width: int, height: int, device: torch.device) -> None:
-    """What a pixel shows does not depend on the image that it is in."""
     scene = large_scene(200, device)
     whole = make_camera(scene)
     left, top = (SIDE - width) // 2, (SIDE - height) // 2

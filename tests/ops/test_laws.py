@@ -117,7 +117,6 @@ def test_awkward_surfels_agree_with_the_reference(device: torch.device) -> None:
 
 @pytest.mark.parametrize("max_hits", [0, 1, 2, 3, 5, 8])
 def test_every_buffer_size(max_hits: int, device: torch.device) -> None:
-    """The K heaviest are the first K of the eight heaviest."""
     scene = layered_scene(device=device)
     most, out = (draw(scene, max_hits=size) for size in (MAX_HITS, max_hits))
     assert_same_ids(out.ids, most.ids[..., :max_hits], name="ids")

@@ -29,10 +29,6 @@ def view_of(scene: Scene) -> View:
     return View(fx, fy, cx, cy, scene["width"], scene["height"], scene["near"])
 
 
-def shape_of(scene: Scene) -> Shape:
-    return Shape(*(scene[key] for key in FLOATS))
-
-
 def sheets(
     *surfels: tuple[float, float], scale: tuple[float, float] = (0.2, 0.1)
 ) -> tuple[Shape, torch.Tensor, torch.Tensor]:

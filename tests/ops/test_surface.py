@@ -56,7 +56,6 @@ def test_surface_agrees_with_the_reference(dtype: torch.dtype, name: str, device
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize("depth", [0.5, 7.0])
 def test_an_opaque_quad_has_its_depth_and_its_normal(depth: float, turned: bool, device: torch.device) -> None:
-    """Whichever side the camera sees, the normal points at it."""
     out = draw(facing_quads((depth, 0.99), device=device, turned=turned))
     for name in DEPTHS:
         assert_everywhere(getattr(out, name), depth, name)

@@ -112,7 +112,6 @@ def test_gradients_repeat_bit_for_bit() -> None:
 
 @pytest.mark.cuda
 def test_cuda_agrees_with_the_cpu() -> None:
-    """Thousands of surfels, in float32: values and gradients."""
     results = []
     for device in ("cpu", "cuda"):
         scene = random_scene(3000, seed=5, width=200, height=150, device=device)

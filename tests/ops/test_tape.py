@@ -44,7 +44,6 @@ def test_tape_and_torch_give_the_same_gradients_of_a_nexel(device: torch.device)
 
 
 def test_residual_colors_are_composed_with_the_plain_ones(device: torch.device) -> None:
-    """`base` goes through the tape, too."""
     generator = torch.Generator().manual_seed(0)
     shapes = ((7, 3), (14, 3), (7, 2), (7,), (1, 3), (7, 3))
     tensors = [torch.rand(*shape, generator=generator, dtype=torch.float64).to(device) for shape in shapes]

@@ -42,7 +42,6 @@ def test_lists_are_near_to_far_and_cover_every_hit(device: torch.device) -> None
 
 
 def test_a_surfel_is_listed_in_the_tiles_of_its_quad_not_of_its_box(device: torch.device) -> None:
-    """A thin diagonal bar touches about a diagonal of the tiles."""
     turn = torch.tensor([0.9238795, 0.0, 0.0, 0.3826834], device=device)  # 45 degrees about the view axis
     scene = facing_scene((4.0, 0.99), gamma=50.0, size=(128, 128), focal=320.0, device=device)
     scene |= {"quats": turn[None], "scales": torch.tensor([[1.0, 0.005]], device=device)}

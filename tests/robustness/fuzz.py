@@ -98,8 +98,9 @@ class Campaign:
         result, end = Result(), time.monotonic() + seconds
         context = multiprocessing.get_context("fork")
         with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as scratch:
-            valid = self.target.make(Path(scratch) / "valid")
-            folder = Path(scratch) / "input"
+            made, folder = Path(scratch) / "valid", Path(scratch) / "input"
+            made.mkdir()
+            valid = self.target.make(made)
             while result.inputs < inputs and time.monotonic() < end:
                 indices = range(result.inputs, min(result.inputs + BATCH, inputs))
                 ours, theirs = context.Pipe(duplex=False)

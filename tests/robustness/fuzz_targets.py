@@ -102,7 +102,6 @@ def _colmap(text: bool) -> Callable[[Path], list[Files]]:
 
 
 def _ply(folder: Path) -> list[Files]:
-    folder.mkdir(parents=True)
     numbers = np.arange(18.0).reshape(6, 3)
     for form in ("ascii", "binary_little_endian", "binary_big_endian"):
         write_points(folder / form, 0.1 * numbers, numbers.astype(np.uint8), form)
@@ -169,7 +168,6 @@ def _trainer() -> nw.Trainer:
 
 
 def _checkpoint(folder: Path) -> list[Files]:
-    folder.mkdir(parents=True, exist_ok=True)
     _trainer().save(folder)
     _check_rendering(_trainer().model())
     return [_files(folder)]
@@ -199,7 +197,6 @@ def _metrics(folder: Path) -> list[Files]:
 
 
 def _photo_table(folder: Path) -> list[Files]:
-    folder.mkdir(parents=True, exist_ok=True)
     table = 'photo,split,psnr,sharpness\n"a, b.png",test,inf,0.3\nc/d.png,train,20.125,1e-05\n'
     (folder / "photos.csv").write_text(table)
     return [_files(folder)]
@@ -249,7 +246,6 @@ def _camera_path(folder: Path) -> list[Files]:
 
 
 def _images(folder: Path) -> list[Files]:
-    folder.mkdir(parents=True, exist_ok=True)
     color, wide = _noise(4), _noise(most=2**16, dtype=np.uint16)
     rgb, grey, palette = (color.convert(mode) for mode in ("RGB", "L", "P"))
     pictures = {
@@ -278,7 +274,6 @@ def _read_images(folder: Path) -> None:
 
 
 def _photo_files(folder: Path) -> list[Files]:
-    folder.mkdir(parents=True, exist_ok=True)
     exif = Image.Exif()
     exif[MAKE], exif[MODEL] = "maker", "model"
     exif[274] = 6  # orientation
@@ -310,7 +305,6 @@ def _exr(folder: Path) -> list[Files]:
 
 
 def _depths(folder: Path) -> list[Files]:
-    folder.mkdir(parents=True, exist_ok=True)
     values = 1 + np.random.default_rng(0).random((HEIGHT, WIDTH), np.float32)
     Image.fromarray((1000 * values).astype(np.uint16)).save(folder / "a.png")
     np.save(folder / "a.npy", values)
@@ -326,7 +320,6 @@ def _read_depths(folder: Path) -> None:
 
 
 def _linear(folder: Path) -> list[Files]:
-    folder.mkdir(parents=True, exist_ok=True)
     save_exr(folder / "a.exr", {"image": torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))})
     _noise(3).save(folder / "a.png")
     return [{name: data} for name, data in _files(folder).items()]

@@ -38,6 +38,7 @@ def test_readers_load_or_refuse_in_one_line(tmp_path: Path, long: bool) -> None:
 @pytest.mark.parametrize("name", TARGETS)
 def test_the_valid_files_load(tmp_path: Path, name: str) -> None:
     target = TARGETS[name]
+    (tmp_path / "valid").mkdir()
     for index, files in enumerate(target.make(tmp_path / "valid")):
         write_input(tmp_path / str(index), files)
         target.read(tmp_path / str(index))

@@ -72,7 +72,6 @@ def separate_allocations(device: torch.device) -> Iterator[None]:
 
 
 def test_steps_and_frames_run(device: torch.device) -> None:
-    """As by default and with fixed-order sums."""
     scene = tiny_scene()
     base = nw.preset("default")
     config = dataclasses.replace(
@@ -97,7 +96,6 @@ def test_steps_and_frames_run(device: torch.device) -> None:
 
 
 def test_renderings_of_odd_sizes_run(device: torch.device) -> None:
-    """With all their buffers and gradients."""
     texture = make_texture(device=device)
     for max_hits in range(9) if device.type == "cuda" else (2,):  # all K where kernels are compiled in seconds
         for width, height in SIZES:

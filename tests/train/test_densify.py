@@ -114,7 +114,6 @@ def test_children_tile_their_parent():
 
 
 def test_split_copies_everything_else_and_leaves_others_alone():
-    """Children start without moments, others keep theirs."""
     surfels, optimizer = make(20, seed=1)
     old, before = rows_of(surfels), moments_of(surfels, optimizer)
     chosen = torch.tensor([0, 6, 13])
@@ -225,7 +224,6 @@ def test_at_the_budget_children_take_the_rows_of_pruned_surfels():
     [(20, True, 3, 3, 3), (20, False, 3, 0, 0), (21, True, 2, 3, 2), (21, False, 3, 1, 3)],
 )
 def test_prune_at_the_cap_is_a_choice_and_other_rounds_prune(budget, at_cap, faint, more, pruned):
-    """Near the budget, places are filled before rows are appended."""
     surfels, optimizer = make(20, opacity=0.5)
     with torch.no_grad():
         surfels.logit_opacities[:faint] = -8.0
@@ -300,7 +298,6 @@ def test_a_loop_of_ones_own_takes_along_what_belongs_to_surfels(kind, budget):
 
 
 def test_rounds_come_when_the_paper_says():
-    """Every 100 from 500 to 25,000, both ends out."""
     surfels, _ = make(4)
     densifier = densifier_of(surfels)
     assert [i for i in range(30_001) if densifier.due(i)] == list(range(600, 25_000, 100))

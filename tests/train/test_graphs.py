@@ -133,7 +133,6 @@ def test_sizes_beyond_the_first_few(tiny_scene: nw.Scene, monkeypatch: pytest.Mo
 
 
 def test_a_first_training_in_a_process(tiny_folder: Path) -> None:
-    """Nothing else has started Warp."""
     code = (
         "import nexwarp as nw; from nexwarp.train.recipe import Config; from nexwarp.train.trainer import Trainer\n"
         f"trainer = Trainer(nw.load_scene({str(tiny_folder)!r}), Config(max_surfels=100), 'cuda')\n"

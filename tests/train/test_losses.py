@@ -123,7 +123,6 @@ def test_where_nothing_is_only_the_image_counts() -> None:
 
 
 def test_visible_points_by_hand() -> None:
-    """Those outside, behind or masked are left out."""
     nan = float("nan")
     pixels = torch.tensor([[2.9, 1.1], [4.0, 1.0], [2.5, -0.1], [nan, 1.0], [2.5, 1.5], [0.0, 2.999], [1.0, 3.0]])
     depths = torch.tensor([2.0, 2.0, 2.0, 1.0, -2.0, 5.0, 1.0])

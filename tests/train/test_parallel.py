@@ -161,7 +161,6 @@ def test_rates_follow_the_square_root_of_the_batch(scene: nw.Scene) -> None:
 
 
 def test_ranks_that_do_not_fit_are_refused_alike(scene: nw.Scene, tmp_path: Path) -> None:
-    """All ranks raise the same error, whichever of them it is about."""
     few = dataclasses.replace(scene, train=scene.train[:1])
     view = scene.train[3]
     other = dataclasses.replace(scene, train=[*scene.train[:3], dataclasses.replace(view, image=255 - view.image)])

@@ -98,7 +98,6 @@ def test_an_error_is_told_once(tiny_folder: Path, tmp_path: Path) -> None:
 
 
 def test_ranks_train_teachers_first(tiny_folder: Path, tmp_path: Path) -> None:
-    """And find them again, on all ranks, when the run is resumed."""
     run = tmp_path / "run"
     command = ["train", str(tiny_folder), "--run", str(run), *TRAIN, "--gpus", "2", "--iterations", "40"]
     command += ["--checkpoint-every", "4"]

@@ -223,7 +223,6 @@ def test_a_run_resumes_in_each_stage(run, finished, command, capsys, lost):
 
 @pytest.mark.parametrize("stop", [6, 15])
 def test_a_stopped_run_goes_on_where_it_was(finished, command, tmp_path, monkeypatch, stop):
-    """Whatever the stage that the signal comes in."""
     steps: list[None] = []
     taken: list[None] = []
     step = nw.Trainer.step
@@ -250,7 +249,6 @@ def test_a_stopped_run_goes_on_where_it_was(finished, command, tmp_path, monkeyp
 
 
 def test_a_longer_run_keeps_its_teachers(run: Path, command: Callable[..., int], tiny_scene: nw.Scene) -> None:
-    """All further iterations are the student's."""
     teachers = [(run / "teachers" / name / "model.safetensors").read_bytes() for name in "12"]
     assert command(run, "--resume", iterations=30) == 0
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
@@ -274,7 +272,6 @@ def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(run, command, c
 
 @pytest.mark.parametrize("kind", ["link", "file"])
 def test_what_is_not_the_runs_is_not_taken_for_a_teacher(run, command, tmp_path, capsys, kind):
-    """Nor overwritten: nothing changes."""
     place = run / "teachers"
     place.rename(tmp_path / "elsewhere")
     place.symlink_to(tmp_path / "elsewhere") if kind == "link" else place.write_text("mine")

@@ -53,7 +53,6 @@ def test_every_other_step_has_a_teachers_picture(tiny_scene: Scene, teachers: li
 
 
 def test_a_picture_is_at_the_mean_exposure_on_the_steps_background(tiny_scene: Scene, teachers: list[Model]) -> None:
-    """Whatever gains and background the teacher has."""
     exposures = Exposures.of(
         torch.linspace(-0.7, 0.7, 3 * len(tiny_scene.train)).view(-1, 3), [view.camera for view in tiny_scene.train]
     )

@@ -66,7 +66,6 @@ def test_losses_that_do_not_fit_are_named(scene, losses, error, match):
 
 @pytest.mark.cuda
 def test_own_losses_are_captured(scene: Scene) -> None:
-    """Replayed steps have the bits of launched ones."""
 
     def loss(rendering: nw.Rendering, target: nw.Target) -> torch.Tensor:
         return 0.1 * (rendering.image - target.photo).square().mean()

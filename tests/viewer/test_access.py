@@ -100,7 +100,6 @@ def refusal(viewer: Viewer, **arguments: object) -> str:
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "LOCALHOST", "0"])
 def test_pages_of_other_servers_are_refused(model, host):
-    """By whatever name the address is given."""
     with serving(model, host=host) as viewer:
         assert "page of another server" in refusal(viewer, origin="http://evil.example")
         path = urlsplit(viewer.url)._replace(scheme="", netloc="").geturl() or "/"

@@ -110,7 +110,6 @@ def test_a_path_is_played_and_kept_as_its_views_say(model, tmp_path, monkeypatch
 
 
 def test_a_sphere_is_drawn_and_its_command_shown(model) -> None:
-    """In the scene's units; what a browser sends is kept in range."""
     commands: list[tuple[np.ndarray, float]] = []
 
     def command(centre: np.ndarray, radius: float) -> str:

@@ -119,7 +119,6 @@ def test_a_reduced_pixel_counts_where_all_of_it_does(tmp_path):
 
 
 def test_masks_are_undistorted_with_their_photos(distorted, tmp_path):
-    """A photo that is white where the mask counts stays so."""
     path = write_nerfstudio(distorted["OPENCV"], tmp_path / "scene")
     mask = np.zeros((72, 96))
     mask[20:50, 30:70] = 1
