@@ -1,4 +1,4 @@
-"""Adam in one kernel for each parameter; learning rates and schedules over a run."""
+"""Adam in one kernel for all parameters; learning rates and schedules over a run."""
 
 import dataclasses
 import inspect
@@ -11,7 +11,7 @@ import torch
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture, Texture
-from nexwarp.ops.adam import Moments, adam_step
+from nexwarp.ops.adam import Stepped, adam_step
 from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config, LossWeights
 
 # Parameters that share a learning rate, as torch's optimizers take them: `params`, a list of leaves; `name`, one of
@@ -25,9 +25,10 @@ POSE_RATES = (2e-4, 2e-6)
 
 
 class FusedAdam(torch.optim.Adam):
-    """Adam whose step is one kernel a parameter; state, groups and checkpoints are those of `torch.optim.Adam`.
+    """Adam whose step is one kernel; state, groups and checkpoints are those of `torch.optim.Adam`.
 
-    Weight decay, AMSGrad and maximisation are not among its options. Parameters are float32.
+    Weight decay, AMSGrad and maximisation are not among its options. Parameters are float32 and contiguous, and all
+    groups have the same betas and eps.
 
     Attributes:
         grid_loss: the regulariser's value before the last step; None without one.
@@ -43,8 +44,13 @@ class FusedAdam(torch.optim.Adam):
 
     # Torch wraps these for its compiler, whose import takes 0.6 s; a step of ours is never compiled.
     def add_param_group(self, param_group: ParameterGroup) -> None:
-        """Add a parameter group, as `torch.optim.Adam` does."""
+        """Add a parameter group, as `torch.optim.Adam` does; ValueError where its parameters or settings do not fit."""
         inspect.unwrap(torch.optim.Adam.add_param_group)(self, param_group)
+        first, added = self.param_groups[0], self.param_groups[-1]
+        if any(x.dtype != torch.float32 or not x.is_contiguous() for x in added["params"]):
+            raise ValueError(f"{added.get('name', 'params')}: expected contiguous float32 parameters")
+        if (added["betas"], added["eps"]) != (first["betas"], first["eps"]):
+            raise ValueError(f"{added.get('name', 'params')}: expected the betas and eps of the other groups")
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Drop all gradients, or zero them, as `torch.optim.Adam` does."""
@@ -69,34 +75,26 @@ class FusedAdam(torch.optim.Adam):
         half = None
         if texture is not None and (texture.grid.is_cuda or texture.half_copy_key() is not None):
             half = texture.half_copy()
-        steps: list[torch.Tensor] = []
-        work = []
+        stepped: list[Stepped] = []
+        of_first: dict[str, torch.Tensor | None] = {}
         for group in self.param_groups:
             for parameter in group["params"]:
-                factors = self._factors if parameter is grid else None
-                if parameter.grad is None and factors is None:
+                if parameter.grad is None and (parameter is not grid or self._factors is None):
                     continue
                 state = self.state[parameter]
                 if not state:
                     state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
                     state["exp_avg"], state["exp_avg_sq"] = (torch.zeros_like(parameter) for _ in range(2))
-                steps.append(state["step"])
-                work.append((group, parameter, state, factors))
-        if steps:
-            torch._foreach_add_(steps, 1)
-        self.grid_loss = None
-        for group, parameter, state, factors in work:
-            loss = adam_step(
-                parameter.detach(),
-                parameter.grad,
-                Moments(state["step"], state["exp_avg"], state["exp_avg_sq"]),
-                torch.as_tensor(group["lr"], dtype=torch.float32, device=parameter.device),
-                betas=group["betas"],
-                epsilon=group["eps"],
-                factors=factors,
-                half=half if parameter is grid else None,
-            )
-            self.grid_loss = self.grid_loss if loss is None else loss
+                rate = torch.as_tensor(group["lr"], dtype=torch.float32, device=parameter.device)
+                moments = state["exp_avg"], state["exp_avg_sq"]
+                one = Stepped(parameter.detach(), *moments, parameter.grad, state["step"], rate)
+                if parameter is grid:
+                    of_first = {"factors": self._factors, "half": half}
+                stepped.insert(0 if parameter is grid else len(stepped), one)
+        if stepped:
+            torch._foreach_add_([one.step for one in stepped], 1)
+        group = self.param_groups[0]
+        self.grid_loss = adam_step(stepped, betas=group["betas"], epsilon=group["eps"], **of_first)
 
 
 def grid_factors(texture: NeuralTexture, weights: LossWeights, cells_unit: float) -> torch.Tensor | None:

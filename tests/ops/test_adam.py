@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.ops.adam import Moments, adam_step
+from nexwarp.ops.adam import Stepped, adam_step
 from nexwarp.train.optimizer import FusedAdam, grid_factors, set_rates
 from nexwarp.train.recipe import LossWeights
 from tests.tolerances import assert_close
@@ -19,12 +19,14 @@ def make_parameters(device: torch.device) -> tuple[nw.NeuralTexture, dict[str, t
         texture.grid.uniform_(-1, 1)
     others = {"small": torch.nn.Parameter(torch.randn(3, device=device))}
     others["odd"] = torch.nn.Parameter(torch.randn(37, 7, device=device))
-    return texture, {**others, "grid": texture.grid}
+    # More than one launch takes, and some without values.
+    rest = {f"{i} more": torch.nn.Parameter(torch.randn(i // 2, 3, device=device)) for i in range(20)}
+    return texture, {**others, "grid": texture.grid, **rest}
 
 
 def make_optimizer(kind: type[torch.optim.Adam], parameters: dict[str, torch.nn.Parameter]) -> torch.optim.Adam:
     groups: list[dict[str, Any]] = [
-        {"params": [x], "lr": torch.tensor(RATES[name], device=x.device)} for name, x in parameters.items()
+        {"params": [x], "lr": torch.tensor(RATES.get(name, 2e-3), device=x.device)} for name, x in parameters.items()
     ]
     if kind is FusedAdam:
         return FusedAdam(groups, eps=1e-15)
@@ -100,9 +102,9 @@ def test_grids_of_any_size_are_regularised(shape: tuple[int, int, int], device: 
     theirs = ours.double().requires_grad_()
     expected = (factors.double()[:, None, None] * theirs.square()).sum()
     (grad,) = torch.autograd.grad(expected, theirs)
-    moments = Moments(torch.ones((), device=device), torch.zeros_like(ours), torch.zeros_like(ours))
-    rate = torch.tensor(0.1, device=device)
-    loss = adam_step(ours, None, moments, rate, betas=(0.9, 0.999), epsilon=1e-15, factors=factors)
+    step, rate = torch.ones((), device=device), torch.tensor(0.1, device=device)
+    moments = Stepped(ours, torch.zeros_like(ours), torch.zeros_like(ours), None, step, rate)
+    loss = adam_step([moments], betas=(0.9, 0.999), epsilon=1e-15, factors=factors)
     assert loss is not None
     assert_close(loss, expected, kind="value", name="loss")
     assert_close(moments.mean, 0.1 * grad, kind="value", name="mean")
@@ -127,3 +129,13 @@ def test_rates_in_tensors_are_the_same_numbers(device: torch.device) -> None:
         expected = [group["lr"] for group in numbers.param_groups]
         assert torch.equal(torch.stack(held).cpu(), torch.tensor(expected))
     assert expected == pytest.approx([last for _, last in ends])
+
+
+@pytest.mark.parametrize(
+    ("values", "settings"),
+    [(torch.zeros(3, dtype=torch.float16), {}), (torch.zeros(3, 2).T, {}), (torch.zeros(3), {"eps": 1e-8})],
+)
+def test_what_its_kernel_cannot_step_is_refused(values: torch.Tensor, settings: dict[str, float]) -> None:
+    optimizer = FusedAdam([{"params": [torch.nn.Parameter(torch.zeros(4))], "lr": 0.1}], eps=1e-15)
+    with pytest.raises(ValueError, match="mine: expected"):
+        optimizer.add_param_group({"params": [torch.nn.Parameter(values)], "lr": 0.1, "name": "mine", **settings})
