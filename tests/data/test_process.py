@@ -54,6 +54,14 @@ def test_a_blur_lowers_sharpness_and_brightness_does_not() -> None:
     assert darker == pytest.approx(values[0], rel=0.1)  # but for the rounding to whole grey levels
 
 
+def test_sharpness_is_the_share_of_the_laplacians_variance() -> None:
+    picture = np.random.default_rng(0).integers(256, size=(9, 13)).astype(np.uint8)
+    padded = np.pad(picture.astype(float), 1, mode="reflect")
+    near = sum(padded[1 + y : 10 + y, 1 + x : 14 + x] for y in (-1, 0, 1) for x in (-1, 0, 1))
+    expected = ((near - 9.0 * picture) / 16).var(ddof=1) / picture.astype(float).var(ddof=1)
+    assert sharpness(picture) == pytest.approx(expected, rel=1e-5)
+
+
 @pytest.mark.parametrize("pixels", [0.25, 0.5, 1.0])
 def test_motion_is_measured_in_pixels(pixels: float) -> None:
     picture = texture()

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nexwarp.io.pictures import THREADS, error_map, png_files, save_png, side_by_side, to_uint8
+from nexwarp.io.pictures import THREADS, error_map, png_files, save_png, side_by_side, to_uint8, viridis
 from tests.cli.support import picture
 
 
@@ -44,6 +44,7 @@ def test_error_map_runs_from_violet_to_yellow_at_a_quarter() -> None:
     assert colours.dtype == torch.uint8 and colours.shape == (1, 6, 3)
     assert colours[0, 0].tolist() == [68, 1, 84]  # viridis' ends
     assert colours[0, 4].tolist() == colours[0, 5].tolist() == [253, 231, 37]
+    assert viridis()[128].tolist() == pytest.approx([33 / 255, 145 / 255, 140 / 255], abs=2 / 255)
     light = colours[0, :5].float() @ torch.tensor([0.2126, 0.7152, 0.0722])
     assert (light.diff() > 0).all(), "a larger error must be lighter"
     red, grey = torch.tensor([[[0.6, 0.0, 0.0]]]), torch.full((1, 1, 3), 0.2)

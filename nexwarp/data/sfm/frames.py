@@ -56,7 +56,8 @@ def sharpness(luma: np.ndarray) -> float:
 
 def photo_luma(pixels: torch.Tensor) -> np.ndarray:
     """Return the (h, w) uint8 brightness of an (H, W, 3) uint8 photo, averaged over blocks if it is twice `SIDE`."""
-    return downscale_image(pixels, max(max(pixels.shape) // SIDE, 1)).float().mean(-1).byte().numpy()
+    red, green, blue = downscale_image(pixels, max(max(pixels.shape) // SIDE, 1)).numpy().transpose(2, 0, 1)
+    return ((red.astype(np.uint16) + green + blue) // np.uint16(3)).astype(np.uint8)
 
 
 def reduced_luma(luma: np.ndarray, longest: int = SIDE) -> np.ndarray:
