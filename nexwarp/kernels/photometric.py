@@ -1,12 +1,12 @@
-"""What compares an image with a photo, and depths with those that are expected, pixel by pixel: a thread is a pixel.
+"""What compares an image with a photo, and depths with those that are expected: a thread is a pixel, or a point.
 
 The loss terms are the L1 of the image, of the texture, and the weight that has no texture.
 
 The image is clamped to [0, 1] (and has no gradient beyond), as the authors' code does.
 With S = sum_k W, a pixel's share is |image - target|, |textured / (S + eps) - target| (both summed over the channels)
 and 1 - S, each times a scale, which holds the term's factor and the number of values. A term whose
-output, or whose incoming gradient, is a null array is left out. At a difference of 0 an L1 has the gradient 0. A
-channel whose target is at least `saturation` has a difference of 0 from any brighter value.
+scale is 0 is 0; one whose incoming gradient is a null array is left out. At a difference of 0 an L1 has the gradient
+0. A channel whose target is at least `saturation` has a difference of 0 from any brighter value.
 """
 
 import functools
@@ -16,6 +16,7 @@ from typing import Any
 import warp as wp
 
 from nexwarp.kernels.types import types
+from nexwarp.native.warp import lane_index, warp_size, warp_sum
 
 WEIGHT_EPSILON = 1e-6  # keeps the un-premultiplied texture finite where nothing is textured
 
@@ -81,12 +82,23 @@ def total(weights: wp.array2d(dtype=Any), p: wp.int32):
     return result
 
 
+@wp.func
+def write_sum(sums: wp.array2d(dtype=Any), k: int, thread: int, x: Any):
+    """Write the sum of x over the thread's warp to row k."""
+    x = warp_sum(x)
+    if lane_index() == 0:
+        sums[k, thread // warp_size()] = x
+
+
 @functools.cache
 def photometric_kernels(real: type) -> SimpleNamespace:
-    """Make the forward and backward kernels; `scales` are those of the terms in order."""
+    """Make the forward and backward kernels; `scales` are those of the terms in order.
+
+    Threads are whole warps, of which each writes its sum of each term.
+    """
     t = types(real)
     vec3 = t.vec3
-    ONE, EPS = t.ONE, wp.constant(real(WEIGHT_EPSILON))
+    ZERO, ONE, EPS = t.ZERO, t.ONE, wp.constant(real(WEIGHT_EPSILON))
 
     @wp.kernel(enable_backward=False, module="unique")
     def photometric(  # noqa: PLR0913  # a kernel entry point
@@ -97,19 +109,22 @@ def photometric_kernels(real: type) -> SimpleNamespace:
         target: wp.array(dtype=vec3),
         scales: vec3,
         saturation: real,
-        # outputs
-        l1: wp.array(dtype=real),
-        texture: wp.array(dtype=real),
-        alpha: wp.array(dtype=real),
+        pixels: wp.int32,
+        # output
+        sums: wp.array2d(dtype=real),
     ):
         p = first + wp.tid()
-        weight = total(weights, p)
-        if l1:
-            l1[p] = distance(difference(clamped_color(image[p]), target[p], saturation)) * scales[0]
-        if texture:
-            texture[p] = distance(difference(textured[p] / (weight + EPS), target[p], saturation)) * scales[1]
-        if alpha:
-            alpha[p] = (ONE - weight) * scales[2]
+        terms = vec3()
+        if p < pixels:
+            weight = total(weights, p)
+            if scales[0] != ZERO:
+                terms[0] = distance(difference(clamped_color(image[p]), target[p], saturation)) * scales[0]
+            if scales[1] != ZERO:
+                terms[1] = distance(difference(textured[p] / (weight + EPS), target[p], saturation)) * scales[1]
+            terms[2] = (ONE - weight) * scales[2]
+        write_sum(sums, 0, p, terms[0])
+        write_sum(sums, 1, p, terms[1])
+        write_sum(sums, 2, p, terms[2])
 
     @wp.kernel(enable_backward=False, module="unique")
     def photometric_backward(  # noqa: PLR0913  # a kernel entry point
@@ -252,17 +267,17 @@ def depth_kernels(real: type) -> SimpleNamespace:
         expected: wp.array(dtype=real),
         places: wp.array(dtype=wp.int64),
         factor: real,
-        # output: the error of each point, and whether it counts
-        terms: wp.array2d(dtype=real),
+        # output: sums of a warp's errors, and how many of its points count
+        sums: wp.array2d(dtype=real),
     ):
         i = first + wp.tid()
         error, known = ZERO, ZERO
-        if expected[i] > ZERO:
+        if i < expected.shape[0] and expected[i] > ZERO:
             p = place_of(places, i)
             error = factor * wp.abs(mean_depth(depths, weights, p) / expected[i] - ONE)
             known = ONE
-        terms[0, i] = error
-        terms[1, i] = known
+        write_sum(sums, 0, i, error)
+        write_sum(sums, 1, i, known)
 
     @wp.kernel(enable_backward=False, module="unique")
     def depth_errors_backward(  # noqa: PLR0913  # a kernel entry point
@@ -272,7 +287,7 @@ def depth_kernels(real: type) -> SimpleNamespace:
         expected: wp.array(dtype=real),
         places: wp.array(dtype=wp.int64),
         factor: real,
-        sums: wp.array(dtype=real),  # of what the other kernel writes
+        totals: wp.array(dtype=real),  # of what the other kernel writes
         grad_loss: wp.array(dtype=real),
         # outputs
         grad_depths: wp.array2d(dtype=real),
@@ -289,7 +304,7 @@ def depth_kernels(real: type) -> SimpleNamespace:
                 break
             if expected[i] > ZERO:
                 change += sign(mean / expected[i] - ONE) / expected[i]
-        change *= grad_loss[0] * factor / wp.max(sums[1], ONE) / (total(weights, p) + EPS)
+        change *= grad_loss[0] * factor / wp.max(totals[1], ONE) / (total(weights, p) + EPS)
         for h in range(depths.shape[1]):
             grad_depths[p, h] = change * weights[p, h]
             grad_weights[p, h] = change * (depths[p, h] - mean)

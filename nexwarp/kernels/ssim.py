@@ -19,6 +19,7 @@ import math
 import warp as wp
 
 from nexwarp.kernels.photometric import clamped, clamped_backward
+from nexwarp.native.warp import lane_index, warp_size, warp_sum
 
 WINDOW_SIZE = 11
 WINDOW_SIGMA = 1.5
@@ -199,7 +200,7 @@ def score(
     losses: wp.array(dtype=wp.float32),
     derivatives: wp.array2d(dtype=wp.float32),
 ):
-    """Sums of (1 - s) scale, one a thread, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
+    """Sums of (1 - s) scale, one a warp, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
     thread = first + wp.tid()
     at = place(thread, width)
     lane = at[0]
@@ -242,7 +243,9 @@ def score(
             ds_dp[o] = s[3]
             if row < height and at[1] + group_column(lane) + 3 * o < width:
                 total += (1.0 - s[0]) * scale
-    losses[thread] = total
+    total = warp_sum(total)
+    if lane_index() == 0:
+        losses[thread // warp_size()] = total
     if not derivatives:
         return
     sync_block()

@@ -47,6 +47,12 @@ def photometric_terms(
     return _Photometric.apply((l1, texture, alpha), math.inf if saturation is None else saturation, *tensors)
 
 
+def _warp_sums(like: torch.Tensor, rows: int, count: int) -> tuple[torch.Tensor, int]:
+    """Room for sums (rows, warps) over the warps of `count` threads or a few more, and how many threads these are."""
+    warp = 32 if like.is_cuda else 1
+    return like.new_empty(rows, -(-count // warp)), -(-count // warp) * warp
+
+
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -55,15 +61,12 @@ class _Photometric(torch.autograd.Function):
         like = next(x for x in tensors if x is not None)
         real, pixels = real_of(like), like.shape[0] * like.shape[1]
         scales = types(real).vec3(factors[0] / (3 * pixels), factors[1] / (3 * pixels), factors[2] / pixels)
-        maps = like.new_empty(sum(factor != 0.0 for factor in factors), pixels)
-        rows = iter(maps)
-        outputs = [next(rows) if factor else None for factor in factors]
-        launch(like, photometric_kernels(real).forward, pixels, [*tensors, scales, saturation], outputs)
+        sums, threads = _warp_sums(like, 3, pixels)
+        launch(like, photometric_kernels(real).forward, threads, [*tensors, scales, saturation, pixels], [sums])
         ctx.save_for_backward(*tensors)
         ctx.rest = scales, saturation
         ctx.set_materialize_grads(False)
-        sums = iter(maps.sum(1).unbind())
-        return tuple(next(sums) if factor else None for factor in factors)
+        return tuple(term if factor else None for term, factor in zip(sums.sum(1).unbind(), factors, strict=True))
 
     @staticmethod
     @first_derivative
@@ -145,7 +148,7 @@ def depth_term(
         depths: (H, W, K) z-depths of the textured hits, world units.
         weights: (H, W, K), W.
         expected: z-depths (H, W), or (M,) of points in the pixels `places`; 0 where unknown, which does not count.
-        places: (M,) int64, row * W + column, ascending.
+        places: (M,) int64, row * W + column, ascending; those beyond the image have the expected depth 0.
         factor: of the mean, which is 0 without any known depth.
     """
     shape: tuple[int | str, ...] = ("H", "W") if places is None else ("M",)
@@ -164,19 +167,19 @@ class _DepthTerm(torch.autograd.Function):
         places: torch.Tensor | None,
         factor: float,
     ) -> torch.Tensor:
-        terms = depths.new_empty(2, expected.numel())
+        sums, threads = _warp_sums(depths, 2, expected.numel())
         inputs = [depths, weights, expected, places, factor]
-        launch(depths, depth_kernels(real_of(depths)).forward, expected.numel(), inputs, [terms])
-        sums = terms.sum(1)
-        ctx.save_for_backward(depths, weights, expected, places, sums)
+        launch(depths, depth_kernels(real_of(depths)).forward, threads, inputs, [sums])
+        totals = sums.sum(1)
+        ctx.save_for_backward(depths, weights, expected, places, totals)
         ctx.rest = factor
-        return sums[0] / sums[1].clamp_min(1)
+        return totals[0] / totals[1].clamp_min(1)
 
     @staticmethod
     @first_derivative
     def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        *tensors, sums = ctx.saved_tensors
+        *tensors, totals = ctx.saved_tensors
         grads = [torch.empty_like(x) for x in tensors[:2]]
-        kernel, pixels = depth_kernels(real_of(sums)).backward, grads[0].shape[0] * grads[0].shape[1]
-        launch(sums, kernel, pixels, [*tensors, ctx.rest, sums, grad], grads)
+        kernel, pixels = depth_kernels(real_of(totals)).backward, grads[0].shape[0] * grads[0].shape[1]
+        launch(totals, kernel, pixels, [*tensors, ctx.rest, totals, grad], grads)
         return (*needed(grads, ctx.needs_input_grad[:2]), None, None, None)
