@@ -30,15 +30,13 @@ def main(folder: str, backend: str, iterations: int, surfels: int) -> None:
     with Ranks.join(device, backend=backend) as ranks:
         for mode in ("eager", "captured", "beside") if backend == "nccl" else ("eager", "beside"):
             trainer = trained(scene, ranks, mode, iterations, surfels)
-            told = {
-                "mode": mode,
-                "ranks": ranks.size,
-                "digests": ranks.gather(digest(trainer)),
+            told = {"mode": mode, "ranks": ranks.size, "digests": ranks.gather(digest(trainer))}
+            told |= {
                 "surfels": len(trainer.surfels),
                 "graphs": _graphs_of(trainer),
                 "bytes": trainer.reducer.bytes_sent,
-                "views_per_second": round(trainer.iteration / trainer.seconds, 1),
             }
+            told |= {"views_per_second": round(trainer.iteration / trainer.seconds, 1)}
             if ranks.first:
                 print(json.dumps(told), flush=True)
 

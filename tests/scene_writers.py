@@ -131,17 +131,10 @@ def write_nerfstudio(demo: Path, folder: Path, applied: np.ndarray = APPLIED) ->
     model = reconstruction_of(demo)
     camera = model.camera(1)
     params = dict(zip([p.strip() for p in camera.params_info.split(",")], camera.params, strict=True))
-    data = {
-        "camera_model": "OPENCV" if camera.model.name == "PINHOLE" else camera.model.name,
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": params.pop("fx"),
-        "fl_y": params.pop("fy"),
-        **params,
-        "applied_transform": applied.tolist(),
-        "ply_file_path": "sparse_pc.ply",
-        "frames": [],
-    }
+    kind = "OPENCV" if camera.model.name == "PINHOLE" else camera.model.name
+    data = {"camera_model": kind, "w": camera.width, "h": camera.height, "fl_x": params.pop("fx")}
+    data |= {"fl_y": params.pop("fy"), **params, "applied_transform": applied.tolist()}
+    data |= {"ply_file_path": "sparse_pc.ply", "frames": []}
     moved = np.vstack([applied, [0, 0, 0, 1]])
     for index in model.reg_image_ids():
         image = model.image(index)

@@ -199,17 +199,8 @@ def make_texture(
     device: torch.device | str = "cpu",
 ) -> nw.NeuralTexture:
     """Make a small field with random features and matrices, large enough to be seen in the image."""
-    texture = nw.NeuralTexture(
-        levels=4,
-        table_size=2**8,
-        features=2,
-        min_resolution=1.0,
-        max_resolution=6.0,
-        width=16,
-        hidden_layers=2,
-        sh_degree=sh_degree,
-        residual=residual,
-    )
+    shape = {"width": 16, "hidden_layers": 2, "sh_degree": sh_degree, "residual": residual}
+    texture = nw.NeuralTexture(4, 2**8, 2, 1.0, 6.0, **shape)  # type: ignore[arg-type]
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         texture.grid.copy_(torch.randn(texture.grid.shape, generator=generator))

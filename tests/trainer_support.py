@@ -53,13 +53,8 @@ def rescaled(scene: nw.Scene, factor: float) -> nw.Scene:
         assert view.points is not None
         return dataclasses.replace(view, camera=camera, points=view.points * factor)
 
-    return dataclasses.replace(
-        scene,
-        train=[moved(view) for view in scene.train],
-        test=[moved(view) for view in scene.test],
-        points=scene.points * factor,
-        scale=scene.scale * factor,
-    )
+    train, test = ([moved(view) for view in views] for views in (scene.train, scene.test))
+    return dataclasses.replace(scene, train=train, test=test, points=scene.points * factor, scale=scene.scale * factor)
 
 
 def assert_resumed_alike(straight: nw.Trainer, folder: Path, stop: int = 7, **options: Any) -> None:

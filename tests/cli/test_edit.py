@@ -70,9 +70,8 @@ def test_the_ground_of_a_tilted_scene_becomes_y_0(tmp_path):
     quats = torch.tensor([[0.3, 0.8, -0.4, 0.2]]).expand(390, 4)
     scales = torch.cat([torch.full((380, 2), 0.1), torch.full((10, 2), 3.0)])
     ones = torch.ones(390)
-    surfels = nw.Surfels.from_activated(
-        means.float(), quats, scales, 0.9 * ones, torch.ones(390, 2), torch.zeros(390, 1, 3)
-    )
+    shape = means.float(), quats, scales, 0.9 * ones, torch.ones(390, 2)
+    surfels = nw.Surfels.from_activated(*shape, torch.zeros(390, 1, 3))
     nw.Model(surfels, None).save(tmp_path)
     K, up = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]]), torch.tensor([0.0, 0, 1]).double()
     cameras = {}

@@ -366,13 +366,9 @@ def test_advice_fits_the_trouble(found, registered, text):
 def test_every_photo_left_out_has_its_reason():
     found = overlaps(RICH | {"g": 3, "h": 900}, ["ab", "bc", "ad", "ef", "fh"])
     reasons = left_out(found, "abc", [["a", "b", "c"], ["e", "f", "x"]])
-    assert reasons == {
-        "d": "too few points in common with the 1 registered photos that it overlaps",
-        "e": "in a separate model of 3 photos",
-        "f": "in a separate model of 3 photos",
-        "g": "only 3 features: dark, blurred or without texture",
-        "h": "overlaps no registered photo",
-    }
+    assert reasons["d"] == "too few points in common with the 1 registered photos that it overlaps"
+    assert reasons["e"] == reasons["f"] == "in a separate model of 3 photos" and len(reasons) == 5
+    assert reasons["g"].startswith("only 3 features") and reasons["h"] == "overlaps no registered photo"
 
 
 def with_files(**files: Any):

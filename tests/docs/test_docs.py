@@ -32,15 +32,9 @@ ROOT = DOCS.parent
 
 # The publication's symbol of a setting, and the section that gives its value (docs/paper.md has their titles);
 # "code": only the authors' code gives it.
-SYMBOLS: dict[str, tuple[str, str]] = {
-    "iterations": ("", "4.3"),
-    "max_surfels": ("P", "4.3"),
-    "max_hits": ("K", "5"),
-    "sh_degree": ("S = (d + 1)^2", "5"),
-    "background": ("", "code"),
-    "seed": ("", "code"),
-    "texture.table_size": ("T", "5"),
-}
+CODE = dict.fromkeys(("background", "seed"), ("", "code"))
+SYMBOLS = {"iterations": ("", "4.3"), "max_surfels": ("P", "4.3"), "max_hits": ("K", "5"), **CODE}
+SYMBOLS |= {"sh_degree": ("S = (d + 1)^2", "5"), "texture.table_size": ("T", "5")}
 
 SETTINGS = """\
 # Settings
@@ -138,12 +132,8 @@ Python](python.md) shows how they go together. `python -m tests.docs.test_docs -
 docstrings, which `help(nw.render)` shows, too.
 """
 # Titles, and the rooms of the package whose names stand below them.
-ROOMS = {
-    "Models and rendering": ("model", "ops", "kernels", "export"),
-    "Cameras": ("cameras",),
-    "Scenes": ("data", "io"),
-    "Training": ("train", "run", "cli"),
-}
+ROOMS = {"Models and rendering": ("model", "ops", "kernels", "export"), "Cameras": ("cameras",)}
+ROOMS |= {"Scenes": ("data", "io"), "Training": ("train", "run", "cli")}
 SECTION = re.compile(r"(Args|Attributes|Buffers|Returns|Yields|Raises):")
 
 

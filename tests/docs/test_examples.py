@@ -19,12 +19,9 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 def model(tiny_scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder with a small model of the demo and its cameras."""
     folder = tmp_path_factory.mktemp("runs") / "tiny"
-    config = nw.Config(
-        iterations=100,
-        max_surfels=500,
-        texture=TextureConfig(levels=4, table_size=2**10, width=16),
-        rates=LearningRates(means=(5e-4, 5e-6), scales=2.5e-2, opacities=0.05, sh0=1.25e-2, grid=(2e-2, 2e-4)),
-    )
+    rates = LearningRates(means=(5e-4, 5e-6), scales=2.5e-2, opacities=0.05, sh0=1.25e-2, grid=(2e-2, 2e-4))
+    texture = TextureConfig(levels=4, table_size=2**10, width=16)
+    config = nw.Config(iterations=100, max_surfels=500, texture=texture, rates=rates)
     nw.train(tiny_scene, config, device="cpu").save(folder)
     sets = {"train": tiny_scene.train, "test": tiny_scene.test}
     save_cameras(folder / "cameras.json", {name: {v.name: v.camera for v in views} for name, views in sets.items()})

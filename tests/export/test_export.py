@@ -200,15 +200,10 @@ def test_an_affine_renderer_shows_large_surfels_as_we_do(tmp_path: Path) -> None
     for extent in (float("inf"), 0.1):
         save_splats_ply(tmp_path / "a.ply", gaussians(surfels, 3, [camera], extent))
         columns = {name: x.double() for name, x in read(tmp_path / "a.ply").items()}
-        theirs = ewa.render(
-            stack(columns, "x", "y", "z"),
-            stack(columns, *numbered("rot", 4)),
-            stack(columns, *numbered("scale", 3)).exp(),
-            columns["opacity"].sigmoid(),
-            0.5 + 0.28209479177387814 * stack(columns, *numbered("f_dc", 3)),
-            camera,
-            (0.2, 0.5, 0.8),
-        )
+        quats, scales = (stack(columns, *numbered(name, n)) for name, n in (("rot", 4), ("scale", 3)))
+        shape = stack(columns, "x", "y", "z"), quats, scales.exp(), columns["opacity"].sigmoid()
+        colors = 0.5 + 0.28209479177387814 * stack(columns, *numbered("f_dc", 3))
+        theirs = ewa.render(*shape, colors, camera, (0.2, 0.5, 0.8))
         found.append(float(psnr(to_uint8(theirs.float()), to_uint8(mine))))
     assert found[0] < 30 and found[1] >= 35, found
 

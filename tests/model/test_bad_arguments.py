@@ -123,24 +123,16 @@ def test_ends_of_the_ranges(dtype: torch.dtype) -> None:
     assert (surfels.scales > 0).all()
 
 
-BAD_TEXTURES = [
-    ("levels", ValueError, 0),
-    ("table_size", ValueError, 1000),
-    ("features", ValueError, 3),
-    ("min_resolution", ValueError, 0.0),
-    ("max_resolution", ValueError, 1.0),
-    ("width", ValueError, 0),
-    ("hidden_layers", ValueError, -1),
-    ("sh_degree", ValueError, 4),
-]
+BAD_TEXTURES = [("levels", 0), ("table_size", 1000), ("features", 3), ("min_resolution", 0.0), ("max_resolution", 1.0)]
+BAD_TEXTURES += [("width", 0), ("hidden_layers", -1), ("sh_degree", 4)]
 
 
-@pytest.mark.parametrize(("argument", "error", "value"), BAD_TEXTURES)
-def test_bad_texture(argument: str, error: type[Exception], value: Any) -> None:
+@pytest.mark.parametrize(("argument", "value"), BAD_TEXTURES)
+def test_bad_texture(argument: str, value: Any) -> None:
     good: dict[str, Any] = {"levels": 2, "table_size": 2**6, "features": 2}
     good |= {"min_resolution": 2.0, "max_resolution": 8.0}
     nw.NeuralTexture(**good)
-    assert_refused(error, argument, nw.NeuralTexture, **(good | {argument: value}))
+    assert_refused(ValueError, argument, nw.NeuralTexture, **(good | {argument: value}))
 
 
 BAD_RENDERS = [

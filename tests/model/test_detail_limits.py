@@ -30,12 +30,8 @@ def limits(surfels: nw.Surfels, nearest: float = 0.0, farthest: float = NEVER) -
 
 
 def limited(
-    surfels: nw.Surfels,
-    texture: nw.NeuralTexture | None,
-    camera: nw.Camera,
-    limits: DetailLimits | None,
-    **changes: Any,
-) -> nw.Rendering:
+    surfels: nw.Surfels, texture: nw.NeuralTexture | None, camera: nw.Camera, limits: Any, **changes: Any
+) -> Any:
     return draw_parts(surfels, texture, camera, nw.RenderOptions(**changes), limits=limits)
 
 

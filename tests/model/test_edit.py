@@ -81,14 +81,9 @@ def sphere_model(planted: torch.Tensor, opacities: torch.Tensor) -> nw.Model:
     normals = torch.cat([spread(600), torch.nn.functional.normalize(planted, dim=1)])
     # The half-way rotation from z to the normal.
     quats = torch.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], torch.zeros(len(normals))], dim=1)
-    surfels = nw.Surfels.from_activated(
-        torch.cat([spread(600), planted]),
-        quats,
-        torch.full((len(normals), 2), 0.12),
-        torch.cat([torch.full((600,), 0.98), opacities]),
-        torch.full((len(normals), 2), 1.5),
-        torch.zeros(len(normals), 1, 3),
-    )
+    count, opacities = len(normals), torch.cat([torch.full((600,), 0.98), opacities])
+    means, scales, gammas = torch.cat([spread(600), planted]), torch.full((count, 2), 0.12), torch.full((count, 2), 1.5)
+    surfels = nw.Surfels.from_activated(means, quats, scales, opacities, gammas, torch.zeros(count, 1, 3))
     return nw.Model(surfels, None)
 
 

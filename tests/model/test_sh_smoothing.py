@@ -30,14 +30,9 @@ def around(angles: list[float]) -> list[nw.View]:
 def blob(device: torch.device) -> nw.Surfels:
     """A surfel in the middle, seen from all sides but its edge, and one behind all cameras."""
     generator = torch.Generator().manual_seed(3)
-    surfels = nw.Surfels.from_activated(
-        torch.tensor([[0.0, 0.0, 0.0], [0.0, 300.0, 0.0]]),
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2),
-        torch.full((2, 2), 0.4),
-        torch.full((2,), 0.9),
-        torch.ones(2, 2),
-        0.2 * torch.randn(2, 16, 3, generator=generator),
-    )
+    means, quats = torch.tensor([[0.0, 0.0, 0.0], [0.0, 300.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2)
+    shape = means, quats, torch.full((2, 2), 0.4), torch.full((2,), 0.9), torch.ones(2, 2)
+    surfels = nw.Surfels.from_activated(*shape, 0.2 * torch.randn(2, 16, 3, generator=generator))
     return surfels.to(device)
 
 

@@ -86,12 +86,5 @@ def render(
 
     textured = (hits.weights[..., None] * texels).sum(dim=-2)
     behind = (1 - hits.alpha)[..., None] * torch.as_tensor(background, dtype=means.dtype, device=means.device)
-    return Rendering(
-        image=hits.plain + textured + behind,
-        plain=hits.plain,
-        textured=textured,
-        ids=hits.ids,
-        depths=hits.depths,
-        weights=hits.weights,
-        alpha=hits.alpha,
-    )
+    image = hits.plain + textured + behind
+    return Rendering(image, hits.plain, textured, hits.ids, hits.depths, hits.weights, hits.alpha)

@@ -59,13 +59,9 @@ def test_render_agrees_with_the_reference(name, textured, max_hits, sh_degree, c
         texture.half_precision = half
         if half:
             texture.half().float()
-    options: dict[str, Any] = {
-        "max_hits": max_hits,
-        "background": BACKGROUND,
-        "sh_degree": sh_degree,
-        "clamp_texture": clamp_texture,
-        "order": "distance" if name == "wide" else "depth",
-    }
+    order = "distance" if name == "wide" else "depth"
+    options: dict[str, Any] = {"max_hits": max_hits, "background": BACKGROUND, "sh_degree": sh_degree}
+    options |= {"clamp_texture": clamp_texture, "order": order}
     flips = 0.0 if dtype == torch.float64 else FLIPS
 
     surfels64, texture64 = twin(surfels), twin(texture)

@@ -25,14 +25,8 @@ pytestmark = pytest.mark.usefixtures("small_preset")
 
 # Nothing is written while exposures are estimated, SH smoothed and detail limits found, which would take most of such a
 # short training.
-SMALL = Config(
-    exposures=False,
-    smooth_sh=0.0,
-    footprints=False,
-    texture=TextureConfig(levels=2, table_size=2**6, width=8),
-    densify=DensifyConfig(every=2),
-    sh_degree=1,
-)
+TINY = {"texture": TextureConfig(levels=2, table_size=2**6, width=8), "densify": DensifyConfig(every=2)}
+SMALL = Config(exposures=False, smooth_sh=0.0, footprints=False, sh_degree=1, **TINY)  # type: ignore[arg-type]
 FLAGS = ["--iterations", "2", "--max-surfels", "24", "--device", "cpu", "--checkpoint-every", "1"]
 FULL, BROKEN = errno.ENOSPC, errno.EIO
 

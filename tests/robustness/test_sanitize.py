@@ -74,12 +74,9 @@ def separate_allocations(device: torch.device) -> Iterator[None]:
 def test_steps_and_frames_run(device: torch.device) -> None:
     scene = tiny_scene()
     base = nw.preset("default")
-    config = dataclasses.replace(
-        base,
-        max_surfels=200,
-        texture=dataclasses.replace(base.texture, levels=8, table_size=2**10),
-        densify=dataclasses.replace(base.densify, fraction=1.0, prune_opacity=0.02),
-    )
+    texture = dataclasses.replace(base.texture, levels=8, table_size=2**10)
+    densify = dataclasses.replace(base.densify, fraction=1.0, prune_opacity=0.02)
+    config = dataclasses.replace(base, max_surfels=200, texture=texture, densify=densify)
     for deterministic in (False, True):
         trainer = nw.Trainer(scene, dataclasses.replace(config, deterministic=deterministic), device)
         for iteration in ITERATIONS:

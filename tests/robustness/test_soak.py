@@ -18,13 +18,9 @@ STEPS, FRAMES = 240 * TIMES, 240 * TIMES
 TOLERANCE, SLACK = 0.01, 2**18  # a share, and bytes: memory grows by pages and segments
 SIZES = ((1.0, 0.75), (0.67, 0.5), (0.34, 0.73), (0.84, 0.26), (0.5, 0.5), (1.0, 0.18), (0.17, 0.17))  # of the width
 # Surfels are added in rounds until the end, within a budget that is reached soon.
-CONFIG = Config(
-    iterations=STEPS,
-    max_surfels=400,
-    sh_every=1,
-    texture=TextureConfig(levels=8, table_size=2**13, width=32),
-    densify=DensifyConfig(start=0, stop=60_000, every=30, fraction=1.0, prune_opacity=0.02),
-)
+DENSIFY = DensifyConfig(start=0, stop=60_000, every=30, fraction=1.0, prune_opacity=0.02)
+TEXTURE = TextureConfig(levels=8, table_size=2**13, width=32)
+CONFIG = Config(iterations=STEPS, max_surfels=400, sh_every=1, texture=TEXTURE, densify=DENSIFY)
 
 
 def memory(device: torch.device) -> dict[str, float]:

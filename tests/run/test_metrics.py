@@ -36,16 +36,9 @@ def test_psnr_is_scikit_images(device: torch.device) -> None:
 
 def test_ssim_map_is_scikit_images_away_from_the_border(device: torch.device) -> None:
     image, target = images()
-    _, expected = skimage.metrics.structural_similarity(
-        image.double().numpy() / 255,
-        target.double().numpy() / 255,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        data_range=1.0,
-        channel_axis=2,
-        full=True,
-    )
+    pair = (x.double().numpy() / 255 for x in (image, target))
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1.0, "full": True}
+    _, expected = skimage.metrics.structural_similarity(*pair, channel_axis=2, **options)
     actual = ssim_map(image.to(device), target.to(device)).cpu().double()
     inside = slice(5, -5)
     difference = (actual - torch.from_numpy(expected))[inside, inside]

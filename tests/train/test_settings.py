@@ -86,9 +86,8 @@ def test_paper_is_the_paper():
     assert (p.preset, p.iterations, p.max_hits, p.sh_degree, p.sh_every) == ("paper", 30_000, 2, 3, 1000)
     assert (p.max_surfels, p.background, p.more_hits_from, p.mask_mode) == (400_000, (0.0, 0.0, 0.0), 0, "ignore")
     assert not any((p.filter_points, p.orient_points, p.footprints, p.smooth_sh, p.exposures))
-    assert p.losses == LossWeights(
-        dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, depth=0.0, depth_maps=0.0
-    )
+    zero = {"depth": 0.0, "depth_maps": 0.0}
+    assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, **zero)
     constant = {"quats": 1e-3, "scales": 5e-3, "opacities": 0.025, "gammas": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
     assert p.rates == LearningRates(means=(1.6e-4, 1.6e-6), grid=(1e-3, 1e-5), mlp=(1e-3, 1e-3), **constant)
     sizes = {"levels": 16, "table_size": 2**20, "features": 2, "width": 64, "hidden_layers": 2, "sh_degree": None}

@@ -57,9 +57,8 @@ def test_a_picture_is_at_the_mean_exposure_on_the_steps_background(tiny_scene: S
         torch.linspace(-0.7, 0.7, 3 * len(tiny_scene.train)).view(-1, 3), [view.camera for view in tiny_scene.train]
     )
     m = teachers[0]
-    other = Model(
-        m.surfels, m.texture, exposures, m.detail_limits, dataclasses.replace(m.options, background=(1.0, 0.0, 1.0))
-    )
+    options = dataclasses.replace(m.options, background=(1.0, 0.0, 1.0))
+    other = nw.Model(m.surfels, m.texture, exposures, m.detail_limits, options)
     scene = dataclasses.replace(tiny_scene, random_background=True)
     student, behind = Trainer(scene, CONFIG, CPU, teachers=[other]), []
     for _ in range(4):

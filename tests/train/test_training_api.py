@@ -90,13 +90,8 @@ def test_own_losses_are_captured(scene: Scene) -> None:
 
 def parts(scene: Scene) -> dict[str, Any]:
     views = sorted(scene.train + scene.test, key=lambda view: view.name)
-    return {
-        "images": [view.image for view in views],
-        "cameras": [view.camera for view in views],
-        "points": scene.points,
-        "colors": scene.colors,
-        "names": [view.name for view in views],
-    }
+    images, cameras, names = ([getattr(view, name) for view in views] for name in ("image", "camera", "name"))
+    return {"images": images, "cameras": cameras, "points": scene.points, "colors": scene.colors, "names": names}
 
 
 @pytest.mark.parametrize("kind", ["uint8", "float", "numpy", "stacked"])
