@@ -30,7 +30,7 @@ def main(folder: str, backend: str, iterations: int, surfels: int) -> None:
     with Ranks.join(device, backend=backend) as ranks:
         for mode in ("eager", "captured", "beside") if backend == "nccl" else ("eager", "beside"):
             trainer = trained(scene, ranks, mode, iterations, surfels)
-            told = {"mode": mode, "ranks": ranks.size, "digests": ranks.gather(digest(trainer))}
+            told: dict[str, object] = {"mode": mode, "ranks": ranks.size, "digests": ranks.gather(digest(trainer))}
             told |= {
                 "surfels": len(trainer.surfels),
                 "graphs": _graphs_of(trainer),
