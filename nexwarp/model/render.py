@@ -317,5 +317,5 @@ def jitter_factors(
 ) -> torch.Tensor:
     """Draw factors (H, W, K) on depths, N(1, jitter / focal), which shift the texture's points along their rays."""
     shape = (camera.height, camera.width, max_hits)
-    noise = torch.randn(shape, generator=generator, dtype=dtype, device=camera.device)
-    return noise.mul_(jitter / camera.focal).add_(1)
+    factors = torch.empty(shape, dtype=dtype, device=camera.device)
+    return factors.normal_(1.0, jitter / camera.focal, generator=generator)
