@@ -187,10 +187,8 @@ def test_other_wrong_inputs(tmp_path: Path) -> None:
 
 
 def test_cameras_come_back_exactly(tmp_path):
-    saved = {
-        "train": {f"{i}.png": make_camera(random_scene(2, off_centre=i == 1), near=0.1 * i) for i in range(3)},
-        "test": {"folder/a b.jpg": make_camera(random_scene(2, seed=5))},
-    }
+    train = {f"{i}.png": make_camera(random_scene(2, off_centre=i == 1), near=0.1 * i) for i in range(3)}
+    saved = {"train": train, "test": {"folder/a b.jpg": make_camera(random_scene(2, seed=5))}}
     file = tmp_path / "cameras.json"
     save_cameras(file, saved)
     loaded = load_cameras(file)

@@ -45,12 +45,10 @@ def test_properties_in_any_order_and_of_any_kind(tmp_path, order):
 
 
 def test_ascii_after_another_element(tmp_path):
-    rows = "".join(
-        f"{x!r} {y!r} {z!r} {r} {g} {b}\r\n"
-        for (x, y, z), (r, g, b) in zip(POINTS.tolist(), COLORS.tolist(), strict=True)
-    )
+    rows = zip(POINTS.tolist(), COLORS.tolist(), strict=True)
+    text = "".join(f"{x!r} {y!r} {z!r} {r} {g} {b}\r\n" for (x, y, z), (r, g, b) in rows)
     header = "element camera 2\nproperty float f\n" + vertex(40, "double x", "double y", "double z", *RGB)
-    (tmp_path / "a.ply").write_bytes(ply(header, b"1\n2\n" + rows.encode() + b"extra\n", "ascii"))
+    (tmp_path / "a.ply").write_bytes(ply(header, b"1\n2\n" + text.encode() + b"extra\n", "ascii"))
     points, colors = positions_and_colors(tmp_path / "a.ply")
     assert np.array_equal(points, POINTS) and np.array_equal(colors, COLORS)
 

@@ -86,10 +86,8 @@ def test_a_stage_has_the_cards_and_the_surfels(model, cards, views, tmp_path):
     assert_close(dimmed + light, 0.25 * (sh + light), kind="value", name="dimmed SH")
     for shown, hidden in (("surfels", "Cards"), ("cards", "Surfels")):
         stage.GetDefaultPrim().GetVariantSet("shown").SetVariantSelection(shown)
-        visible = {
-            name: UsdGeom.Imageable(stage.GetPrimAtPath(f"/Scene/{name}")).ComputeVisibility() == "inherited"
-            for name in ("Cards", "Surfels")
-        }
+        drawn = {name: UsdGeom.Imageable(stage.GetPrimAtPath(f"/Scene/{name}")) for name in ("Cards", "Surfels")}
+        visible = {name: prim.ComputeVisibility() == "inherited" for name, prim in drawn.items()}
         assert [name for name, is_visible in visible.items() if not is_visible] == [hidden]
 
 

@@ -106,9 +106,8 @@ def encoded(transfer: int) -> np.ndarray:
     display = linear * 203.0 / 1000.0  # BT.2100, table 5: display light of 1,000 nits, system gamma 1.2
     scene = display * (display @ [0.2627, 0.6780, 0.0593])[:, None] ** (1.0 / 1.2 - 1.0)
     with np.errstate(invalid="ignore"):
-        return np.where(
-            scene <= 1 / 12, np.sqrt(3.0 * scene), 0.17883277 * np.log(12.0 * scene - 0.28466892) + 0.55991073
-        )
+        high = 0.17883277 * np.log(12.0 * scene - 0.28466892) + 0.55991073
+        return np.where(scene <= 1 / 12, np.sqrt(3.0 * scene), high)
 
 
 def write_patches(

@@ -1,5 +1,6 @@
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,9 +15,7 @@ BACKGROUND = (0.3, 0.9, 0.1)
 PASSES = [f.name for f in fields(Buffers) if f.name not in ("camera", "background")]
 
 
-def make(
-    count: int = 24, max_hits: int = 2, textured: bool | str = True, device: torch.device | str = "cpu"
-) -> Buffers:
+def make(count: int = 24, max_hits: int = 2, textured: bool | str = True, device: Any = "cpu") -> Buffers:
     scene = random_scene(count, device=device)
     texture = make_texture(device=device, residual=textured == "residual") if textured else None
     surfels, camera = make_surfels(scene), make_camera(scene)

@@ -154,11 +154,8 @@ def test_points_get_their_colours_at_the_mean_exposure(tmp_path):
     scene = nw.load_scene(write_demo(tmp_path / "demo", width=48, height=36, views=24, points=400))
     exposed = with_exposures(scene)
     far = torch.tensor([[1e3, 0.0, 0.0]])
-    exposed = dataclasses.replace(
-        exposed,
-        points=torch.cat([exposed.points, far]),
-        colors=torch.cat([torch.zeros_like(exposed.colors), torch.tensor([[7, 8, 9]], dtype=torch.uint8)]),
-    )
+    colors = torch.cat([torch.zeros_like(exposed.colors), torch.tensor([[7, 8, 9]], dtype=torch.uint8)])
+    exposed = dataclasses.replace(exposed, points=torch.cat([exposed.points, far]), colors=colors)
     colors = present(calibrate_exposures(exposed, Config())).colors
     torch.testing.assert_close(colors[-1], torch.tensor([7.0, 8.0, 9.0]) / 255)
     shown = (colors[:-1] > 0).any(1)

@@ -129,10 +129,8 @@ def values_and_gradients(given: dict[str, torch.Tensor]) -> list[torch.Tensor]:
 
 def test_inputs_need_not_be_contiguous(device: torch.device) -> None:
     given = moved(inputs(), device, torch.float64)
-    turned = {
-        name: x.detach().transpose(0, 1).contiguous().transpose(0, 1).requires_grad_(x.requires_grad)
-        for name, x in given.items()
-    }
+    swapped = {name: x.detach().transpose(0, 1).contiguous().transpose(0, 1) for name, x in given.items()}
+    turned = {name: x.requires_grad_(given[name].requires_grad) for name, x in swapped.items()}
     assert not any(x.is_contiguous() for x in turned.values())
     results = [values_and_gradients(source) for source in (given, turned)]
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))

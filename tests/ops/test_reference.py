@@ -36,9 +36,8 @@ def sheets(
     z, opacities = tensor(*surfels).unbind(-1)
     count = len(surfels)
     quats, scales = tensor((1, 0, 0, 0)).expand(count, -1), tensor(scale).expand(count, -1)
-    shape = Shape(
-        torch.stack([0 * z, 0 * z, z], dim=-1), quats, scales, opacities, tensor((1.0, 1.5)).expand(count, -1)
-    )
+    means = torch.stack([0 * z, 0 * z, z], dim=-1)
+    shape = Shape(means, quats, scales, opacities, tensor((1.0, 1.5)).expand(count, -1))
     return shape, torch.eye(3, dtype=torch.float64)[torch.arange(count) % 3], torch.eye(4, dtype=torch.float64)
 
 

@@ -38,10 +38,8 @@ def grown(samples: list[dict[str, float]]) -> dict[str, tuple[float, float]]:
     quarter = max(len(samples) // 4, 1)
     found = {}
     for name in samples[0]:
-        first, last = (
-            sum(kinds[name] for kinds in part) / quarter
-            for part in (samples[quarter : 2 * quarter], samples[-quarter:])
-        )
+        parts = samples[quarter : 2 * quarter], samples[-quarter:]
+        first, last = (sum(kinds[name] for kinds in part) / quarter for part in parts)
         slack = 0.5 if name in ("files", "threads") else max(TOLERANCE * first, SLACK)
         if abs(last - first) > slack:
             found[name] = first, last

@@ -112,6 +112,9 @@ def test_nothing_that_is_not_finite_is_ever_saved(scene, tmp_path, monkeypatch):
         run.save(tmp_path)
     run.restore(tmp_path)
     assert run.iteration == 1 and not_finite(run._watched()) == []
+    fewer = Trainer(dataclasses.replace(scene, train=scene.train[:-1]), SMALL, "cpu")
+    with pytest.raises(CheckpointError, match=r"expected a checkpoint of this run, .*other training views"):
+        fewer.restore(tmp_path)
 
 
 def test_the_command_line_names_the_fault_and_keeps_the_checkpoint(tiny_folder, tmp_path, monkeypatch, capsys):

@@ -135,10 +135,8 @@ def test_rounds_stretch_with_the_run(scene, iterations, rounds):
 
 def test_surfels_settle_with_two_hits(scene):
     """Up to 25,000 of 30,000 iterations, a run with more is one with two; `more_hits_from` 0 has all from the start."""
-    two, four, early = (
-        nw.Trainer(scene, small(iterations=12, max_hits=hits, more_hits_from=start), "cpu")
-        for hits, start in ((2, 25_000), (4, 25_000), (4, 0))
-    )
+    settings = [{"max_hits": hits, "more_hits_from": start} for hits, start in ((2, 25_000), (4, 25_000), (4, 0))]
+    two, four, early = (nw.Trainer(scene, small(iterations=12, **each), "cpu") for each in settings)
     assert [t.render_options().max_hits for t in (two, four, early)] == [2, 2, 4]
     for iteration in range(1, 13):
         for trainer in (two, four, early):

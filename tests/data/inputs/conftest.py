@@ -23,8 +23,5 @@ def demo(tmp_path_factory):
 @pytest.fixture(scope="module")
 def distorted(demo, tmp_path_factory):
     folder = tmp_path_factory.mktemp("distorted")
-    lenses = {"OPENCV": BARREL, "OPENCV_FISHEYE": FISHEYE}
-    return {
-        model: write_distorted(demo, folder / model, demo_lens(demo, model, coefficients))
-        for model, coefficients in lenses.items()
-    }
+    lenses = {"OPENCV": BARREL, "OPENCV_FISHEYE": FISHEYE}.items()
+    return {name: write_distorted(demo, folder / name, demo_lens(demo, name, lens)) for name, lens in lenses}

@@ -44,9 +44,7 @@ def values(dtype, unused, counted, mode=None):
 
 def rgba(color, around, mode="RGBA"):
     """Writer of a transparent file: a colour with alpha where the mask counts, another elsewhere."""
-    return lambda file, mask: Image.fromarray(np.where(mask[..., None], color, around).astype(np.uint8), mode).save(
-        file
-    )
+    return lambda file, mask: Image.fromarray(np.uint8(np.where(mask[..., None], color, around)), mode).save(file)
 
 
 BLACK, WHITE = (0, 0, 0), (255, 255, 255)
