@@ -7,16 +7,19 @@ import os
 import random
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from nexwarp.errors import UNKNOWN, OutOfMemoryError
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 ALLOCATION = re.compile(r"(?:tried|failed|unable) to allocate ([\d.]+ ?(?:[KMGT]iB|bytes))", re.I)
 
 # Errors of CUDA and its libraries, which do not say how much memory they wanted.
@@ -88,6 +91,16 @@ def torch_threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    """Yield what a function returns of each item, in order, by as many threads as torch has; each uses one core.
+
+    It is for work on small tensors in CPU memory, where torch's own threads wait for each other.
+    """
+    count = torch.get_num_threads()
+    with torch_threads(1), ThreadPoolExecutor(count) as pool:
+        yield from pool.map(function, items)
 
 
 @contextmanager

@@ -8,11 +8,13 @@ sphere would be too far.
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 
 from nexwarp.cameras.camera import in_image
 from nexwarp.data.points import InitialPoints
 from nexwarp.data.views import View
+from nexwarp.machine import in_threads
 
 RADIUS = 2.0  # of the sphere, in units of the distance that nearly all points have from the cameras' mean
 NEARLY_ALL = 0.99
@@ -21,7 +23,6 @@ LEAST_SHARE = 1 / 64  # where photos show less of the sphere than this, there ar
 MOST_VIEWS = 256  # that are asked, evenly chosen
 GAP = 0.03  # in image diagonals: a point of the cloud within this distance is near one of the sphere
 MOST_POINTS = 100_000  # of the cloud, evenly chosen: more would not fill other gaps
-PART = 4096  # points of the cloud that are compared at once, to save memory
 
 
 def skybox_points(views: Sequence[View], points: torch.Tensor, count: int) -> InitialPoints:
@@ -41,12 +42,11 @@ def skybox_points(views: Sequence[View], points: torch.Tensor, count: int) -> In
     centre = positions.mean(0)
     reach = (points.double() - centre).norm(dim=1).sort().values[int(NEARLY_ALL * (len(points) - 1))]
     radius = RADIUS * torch.maximum(reach, (positions - centre).norm(dim=1).max())
-    share = (_colors(judges, centre + radius * directions(SAMPLES))[1] > 0).double().mean().item()
+    share = (_looks(judges, centre + radius * directions(SAMPLES), points[:0])[1] > 0).double().mean().item()
     total = math.ceil(count / max(share, LEAST_SHARE))
     towards = directions(total)
-    sums, seen = _colors(judges, centre + radius * towards)
     cloud = points[:: math.ceil(len(points) / MOST_POINTS)]
-    empty = _empty(judges, centre + radius * towards, cloud)
+    sums, seen, empty = _looks(judges, centre + radius * towards, cloud)
     kept = (2 * empty > seen).nonzero()[:, 0]
     kept = kept[torch.linspace(0, len(kept) - 1, min(count, len(kept))).round().long()]  # left out all over the sphere
     spacing = radius * math.sqrt(4 * math.pi / total)
@@ -67,31 +67,34 @@ def directions(count: int) -> torch.Tensor:
     return torch.stack([across * angles.cos(), across * angles.sin(), z], dim=1)
 
 
-def _colors(views: Sequence[View], points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the sums (N, 3) of the colours in [0, 1] at which views show points (N, 3), and how many (N,) do."""
+def _looks(views: Sequence[View], points: torch.Tensor, cloud: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Return the sums (N, 3) of the colours in [0, 1] at which views show points (N, 3), and how many (N,) do.
+
+    And how many (N,) of these show no point of the cloud (M, 3) near it.
+    """
     sums, seen = torch.zeros(len(points), 3, dtype=torch.float64), torch.zeros(len(points), dtype=torch.int64)
-    for view in views:
-        shown, pixels = _shown(view, points)
-        column, row = pixels.long().unbind(1)
-        sums[shown] += view.image[row, column].double() / 255
+    empty = torch.zeros_like(seen)
+    for shown, colors, alone in in_threads(lambda view: _look(view, points, cloud), views):
+        sums[shown] += colors
         seen[shown] += 1
-    return sums, seen
+        empty[shown] += alone
+    return sums, seen, empty
 
 
-def _empty(views: Sequence[View], points: torch.Tensor, cloud: torch.Tensor) -> torch.Tensor:
-    """Return how many (N,) views show each of the points (N, 3), and no point of the cloud (M, 3) near it."""
-    empty = torch.zeros(len(points), dtype=torch.int64)
-    for view in views:
-        camera = view.camera
-        shown, pixels = _shown(view, points)
-        cloud_pixels, depths = camera.project(cloud.float())
-        cloud_pixels = cloud_pixels[in_image(cloud_pixels, depths, camera.width, camera.height)]
-        gap = GAP * math.hypot(camera.width, camera.height)
-        near = torch.zeros(len(shown), dtype=torch.bool)
-        for part in cloud_pixels.split(PART):
-            near |= (torch.cdist(pixels, part) < gap).any(dim=1)
-        empty[shown] += ~near
-    return empty
+def _look(view: View, points: torch.Tensor, cloud: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the indices (M,) of the points that a view shows, their colours (M, 3), and whether they are alone."""
+    from scipy.spatial import cKDTree
+
+    camera = view.camera
+    shown, pixels = _shown(view, points)
+    column, row = pixels.long().unbind(1)
+    around, depths = camera.project(cloud.float())
+    around = around[in_image(around, depths, camera.width, camera.height)]
+    # Balancing the tree would take longer than the few searches.
+    tree = cKDTree(around.numpy(), compact_nodes=False, balanced_tree=False)
+    gap = GAP * math.hypot(camera.width, camera.height)
+    nearest, _ = tree.query(pixels.numpy(), distance_upper_bound=gap)  # infinite beyond it
+    return shown, view.image[row, column].double() / 255, torch.from_numpy(np.isinf(nearest))
 
 
 def _shown(view: View, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -4,7 +4,6 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import cast
 
@@ -12,6 +11,7 @@ from nexwarp.data import View
 from nexwarp.data.sfm.frames import photo_luma, reduced_luma, sharpness
 from nexwarp.errors import FormatError
 from nexwarp.io.files import one_line, write_atomically
+from nexwarp.machine import in_threads
 from nexwarp.run.evaluate import Values
 
 COLUMNS = ["photo", "split", "psnr", "sharpness"]
@@ -26,12 +26,11 @@ def save_photo_table(file: Path, sets: Mapping[str, Sequence[View]], judged: Map
     import kornia.filters  # noqa: F401  # before threads import it at once
 
     photos = [(view, split) for split, views in sets.items() for view in views]
-    with ThreadPoolExecutor() as pool:
-        sharp = pool.map(lambda photo: sharpness(reduced_luma(photo_luma(photo[0].image))), photos)
-        rows = [
-            (view.name, split, cast(float, judged[view.name]["psnr"]), value)
-            for (view, split), value in zip(photos, sharp, strict=True)
-        ]
+    sharp = in_threads(lambda photo: sharpness(reduced_luma(photo_luma(photo[0].image))), photos)
+    rows = [
+        (view.name, split, cast(float, judged[view.name]["psnr"]), value)
+        for (view, split), value in zip(photos, sharp, strict=True)
+    ]
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)

@@ -7,7 +7,6 @@ mean gain, and the lens near no falloff.
 """
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera, in_image
 from nexwarp.data import Scene, View
-from nexwarp.machine import torch_threads
+from nexwarp.machine import in_threads
 from nexwarp.model.exposures import DECIMALS, Exposures
 from nexwarp.train.recipe import Config
 
@@ -57,8 +56,7 @@ def calibrate_exposures(scene: Scene, config: Config) -> ExposureCalibration | N
         return None
     cameras = [view.camera for view in scene.train]
     seen = observations(scene.train)
-    with torch_threads(1):  # threads that share small matrices wait for each other
-        fit = choose_fit(seen, cameras)
+    fit = choose_fit(seen, cameras)
     if fit is None:
         return None
     log_gains = torch.from_numpy(fit.gains)
@@ -114,7 +112,7 @@ class Weights:
 
 def observations(views: Sequence[View]) -> Observations:
     """Return all usable observations of points in photos; a point that photos share has the same bits in each."""
-    parts = [_observed(index, view) for index, view in enumerate(views)]
+    parts = list(in_threads(lambda numbered: _observed(*numbered), enumerate(views)))
     view, places, color, squares = (np.concatenate(values) for values in zip(*parts, strict=True))
     order, point = _numbered(places)
     first = order[np.flatnonzero(np.diff(point, prepend=-1))]
@@ -155,8 +153,7 @@ def choose_fit(seen: Observations, cameras: Sequence[Camera]) -> Fit | None:
     halves = _halves(seen.of_points(np.arange(len(seen.places)) % stride == 0))
     if not halves:  # no points, or one that cannot be cut in two
         return None
-    with ThreadPoolExecutor(len(halves)) as pool:
-        errors = list(pool.map(lambda pair: _held_out_errors(pair[0], pair[1], cameras), halves))
+    errors = list(in_threads(lambda pair: _held_out_errors(pair[0], pair[1], cameras), halves))
     none, gains, both = np.mean(errors, axis=0).tolist()
     vignetting = both < (1 - MARGIN) * gains
     if (both if vignetting else gains) >= (1 - MARGIN) * none:
@@ -236,8 +233,8 @@ class GainSolver:
         """Return the log gains (C, V), mean 0 in each channel, for log colours (C, M)."""
         # The points' own colours, eliminated, leave a Laplacian of the photos.
         right = weights.values * weights.apart(observed)
-        with ThreadPoolExecutor(len(right)) as pool:
-            gains = np.stack(list(pool.map(self._channel, weights.values, weights.totals, right)))
+        channels = zip(weights.values, weights.totals, right, strict=True)
+        gains = np.stack(list(in_threads(lambda channel: self._channel(*channel), channels)))
         return gains - gains.mean(axis=1, keepdims=True)
 
     def _channel(self, weights: np.ndarray, totals: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.kernels import launch
+from nexwarp.machine import in_threads
 from nexwarp.ops.photometric import depth_term
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
@@ -133,3 +134,16 @@ def test_many_points_in_one_pixel_add_up_in_order():
     finally:
         torch.set_num_threads(before)
     assert_identical(results)
+
+
+def test_threads_of_small_work_have_one_torch_thread_each_and_keep_the_order():
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        nested = list(in_threads(lambda i: (i, torch.get_num_threads(), *in_threads(int, [i])), range(40)))
+        assert nested == [(i, 1, i) for i in range(40)]
+        with pytest.raises(ZeroDivisionError):
+            list(in_threads(lambda i: 1 / i, [1, 0, 2]))
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
