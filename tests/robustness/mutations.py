@@ -82,7 +82,7 @@ MUTATIONS = [
     Mutation("train/optimizer.py", "EPSILON = 1e-15", "EPSILON = 1e-8", "tests/train/test_trainer.py -k log_linear"),
     Mutation("train/parallel.py", "1.0 / self.views_a_step if", "1.0 / ranks.size if", "tests/train/test_parallel.py -k incomplete"),
     Mutation("train/target.py", "(1 - alpha)[..., None] * (background", "alpha[..., None] * (background", "tests/train/test_masks.py tests/data/inputs/test_transparency.py -k background"),
-    Mutation("train/exposure.py", "1 / (1 + (left / NOISE) ** 2), left", "1 / (1 + (left / NOISE)), left", "tests/model/test_exposures.py -k 'gains or falloff'"),
+    Mutation("train/exposure.py", "1 / (1 + (left / NOISE) ** 2)", "1 / (1 + (left / NOISE))", "tests/model/test_exposures.py -k 'gains or falloff'"),
     Mutation("model/exposures.py", "log_gains.clamp(self.log_gains.amin(0), self.log_gains.amax(0)).exp()", "log_gains.exp()", "tests/model/test_exposures.py"),
     Mutation("model/options.py", 'check_range("background", value, -LARGEST_COLOR', 'check_range("background", value, 0 * LARGEST_COLOR', "tests/model -k background"),
     # 51: export and the page
