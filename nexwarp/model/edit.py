@@ -16,7 +16,6 @@ from typing import cast
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from nexwarp.cameras.camera import LARGEST_DISTANCE
 from nexwarp.cameras.similarity import IDENTITY, Similarity
@@ -109,6 +108,8 @@ def kept_surfels(surfels: Surfels, edits: Sequence[Edit]) -> np.ndarray:
 
 def moved_poses(means: torch.Tensor, quats: torch.Tensor, motion: Similarity) -> tuple[torch.Tensor, torch.Tensor]:
     """Return means (N, 3) and rotations (N, 4) wxyz, moved; unit rotations, if they turn at all."""
+    from scipy.spatial.transform import Rotation
+
     moved = torch.from_numpy(motion.points(means.detach().cpu().numpy())).to(means)
     if (motion.rotation == np.eye(3)).all():
         return moved, quats
