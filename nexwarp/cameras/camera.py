@@ -1,5 +1,6 @@
 """Pinhole cameras, with OpenCV axes as in COLMAP: x right, y down, z forward."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -120,8 +121,10 @@ class Camera:
 
     def to(self, *args: Any, **kwargs: Any) -> "Camera":
         """Return a copy with `viewmat` and `K` moved or converted; arguments as of `torch.Tensor.to`."""
-        matrices = (self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs))
-        return Camera(*matrices, self.width, self.height, self.near, origin=self.origin)
+        viewmat, K = self.viewmat.to(*args, **kwargs), self.K.to(*args, **kwargs)
+        same = (viewmat.dtype, K.dtype) == (self.viewmat.dtype, self.K.dtype)
+        checked = (self.fx, self.fy, self.cx, self.cy) if same else None
+        return Camera(viewmat, K, self.width, self.height, self.near, origin=self.origin, checked=checked)
 
     def moved(self, origin: tuple[float, float, float]) -> "Camera":
         """Return the same camera in the frame with another origin in world coordinates, computed in float64.
@@ -281,11 +284,13 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     if (width, height) == (camera.width, camera.height):
         return camera
     scale = height / camera.height
+    fx, fy, cy = (number * scale for number in (camera.fx, camera.fy, camera.cy))
+    cx = (camera.cx - camera.width / 2) * scale + width / 2
     K = camera.K.clone()
-    K[0, 0], K[1, 1] = camera.fx * scale, camera.fy * scale
-    K[0, 2] = (camera.cx - camera.width / 2) * scale + width / 2
-    K[1, 2] = camera.cy * scale
-    return replace(camera, K=K, width=width, height=height)
+    K[0, 0], K[1, 1], K[0, 2], K[1, 2] = fx, fy, cx, cy
+    fx, fy, cx, cy = torch.tensor([fx, fy, cx, cy], dtype=K.dtype).tolist()  # as K has them, which may be on a GPU
+    checked = (fx, fy, cx, cy) if min(fx, fy) >= SMALLEST_FOCAL and math.isfinite(fx + fy + cx + cy) else None
+    return replace(camera, K=K, width=width, height=height, checked=checked)
 
 
 def reduced(camera: Camera, height: int) -> Camera:

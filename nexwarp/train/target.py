@@ -234,7 +234,9 @@ class TaughtTargets(TargetSource):
         """Return the target of a step with a teacher: its rendering, of the photo's size, at the mean exposure."""
         _, near, teacher = self.choice(number)
         c = of_photo.camera
-        camera = Camera(near.viewmat.to(c.K.device), c.K, c.width, c.height, c.near, origin=near.origin)
+        camera = dataclasses.replace(
+            c, viewmat=near.viewmat.to(c.K.device), origin=near.origin, checked=(c.fx, c.fy, c.cx, c.cy)
+        )
         with self.launches():
             picture = teacher.render_image(camera, background=of_photo.background, exposure="mean")
         # Gains of 1, and depths of 0, which stand for no point: without masks, steps with photos have the same graph.

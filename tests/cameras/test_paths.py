@@ -257,6 +257,8 @@ def test_resized_camera_sees_the_same_from_top_to_bottom() -> None:
         resized(one, 64, 0)
     small = reduced(one, 24)
     assert (small.width, small.height) == (32, 24) and small.K.equal(resized(one, 32, 24).K)
+    for each in (resized(one.to(torch.float32), 101, 77), one.to(torch.float16), one.to(torch.float64)):
+        assert [each.fx, each.fy, each.cx, each.cy] == each.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     assert reduced(one, 48) is reduced(one, 100) is one
     thin = Camera(one.viewmat, one.K, 2, 48, near=0.2)
     assert reduced(thin, 5).width == 1  # 2 * 5 / 48 is less than half a pixel
