@@ -6,6 +6,7 @@ import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,6 +37,7 @@ EXR, DEEP = ".exr", (".png", ".tif", ".tiff")  # suffixes of files of linear lig
 COPY_QUALITY = 97  # of upright copies of JPEG files
 
 
+@cache
 def decodable_formats() -> list[str]:
     """PIL's names of the formats that are read; HEIF is one of them if the package pillow-heif is installed."""
     from PIL import Image
