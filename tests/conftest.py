@@ -18,6 +18,7 @@ import torch
 import nexwarp as nw
 from nexwarp.data import Scene
 from nexwarp.kernels import launch
+from nexwarp.machine import deterministic
 from nexwarp.train import recipe
 from tests.cli.support import SMALL
 from tests.scene_writers import write_demo
@@ -66,7 +67,7 @@ def usual_signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", autouse=True)
 def one_torch_thread() -> Iterator[None]:
     """Tensors of a small training are tiny, and torch's threads would wait for each other on a busy machine."""
     before = torch.get_num_threads()
@@ -80,6 +81,13 @@ def small_preset(request: pytest.FixtureRequest, one_torch_thread: None) -> Iter
     """The module's SMALL, or that of the commands' tests, as the default preset."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(recipe.PRESETS, "default", getattr(request.module, "SMALL", SMALL))
+        yield
+
+
+@pytest.fixture
+def fixed_order(device: torch.device) -> Iterator[None]:
+    """On CUDA without atomics, whose order differs from one launch to the next."""
+    with deterministic(device.type == "cuda"):
         yield
 
 

@@ -9,6 +9,11 @@ from nexwarp.cli import main as cli
 from tests.cli.support import FLAGS
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_runs(small_preset: None) -> None:
+    """All runs are short and small."""
+
+
 @pytest.fixture(scope="module")
 def scene(tiny_folder: Path) -> Path:
     return tiny_folder

@@ -11,8 +11,6 @@ from nexwarp.cli import main as cli
 from tests.cli.support import refused, snapshot
 from tests.data.test_scene import make_scene
 
-pytestmark = pytest.mark.usefixtures("small_preset")
-
 
 @pytest.fixture
 def refuses(tmp_path, capsys) -> Callable[..., None]:

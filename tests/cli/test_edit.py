@@ -21,7 +21,6 @@ from tests.cli.support import picture, read, refused, snapshot
 from tests.scenes import rigid
 from tests.tolerances import assert_close
 
-pytestmark = pytest.mark.usefixtures("small_preset")
 MOVES = (["--level"], ["--scale-between", "0", "0", "0", "0", "-2", "0", "7"], ["--origin", "-1", "2e0", "-.5"])
 
 

@@ -19,7 +19,7 @@ from tests.narrowing import present
 
 
 @pytest.fixture(autouse=True)
-def few_steps(small_preset, monkeypatch):
+def few_steps(monkeypatch):
     monkeypatch.setattr("nexwarp.export.fit.FEWEST_STEPS", 2)
 
 

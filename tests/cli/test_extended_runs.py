@@ -11,8 +11,6 @@ from nexwarp.train.optimizer import set_rates
 from nexwarp.train.trainer import Trainer
 from tests.cli.support import read
 
-pytestmark = pytest.mark.usefixtures("small_preset")
-
 
 @pytest.fixture(scope="module")
 def extended(trained: Path, scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

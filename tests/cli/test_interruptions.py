@@ -15,8 +15,6 @@ from nexwarp.train.optimizer import FusedAdam
 from nexwarp.train.trainer import Trainer
 from tests.cli.support import FLAGS, RUN_FILES, SHORT, read, refused, snapshot
 
-pytestmark = pytest.mark.usefixtures("small_preset")
-
 
 def interrupt_after(patch: pytest.MonkeyPatch, owner: type, method: str, calls: int, number: int) -> None:
     """Press Ctrl-C, or send another signal, once, in the given call of a method."""

@@ -11,8 +11,6 @@ from nexwarp.errors import RunError
 from nexwarp.run.folder import delete_files, keep_camera_path, list_files, locked_run
 from tests.cli.support import FLAGS, RUN_FILES, read, refused, snapshot
 
-pytestmark = pytest.mark.usefixtures("small_preset")
-
 
 def test_existing_run_is_refused_and_untouched(finished, scene, capsys):
     before = snapshot(finished)

@@ -19,9 +19,6 @@ from tests.cli.support import FLAGS, RUN_FILES, SMALL, picture, read, refused, s
 from tests.data.test_scene import make_scene
 from tests.scene_writers import write_blender, write_points
 
-pytestmark = pytest.mark.usefixtures("small_preset")
-
-
 LINKS: dict[str, object] = {"follow_links": False, "skip_missing": False, "linear": None, "exclude": []}
 
 

@@ -11,8 +11,6 @@ from nexwarp.train.initial import initial_surfels
 from tests.reference.collect import rotations
 from tests.trainer_support import rescaled, small
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 @pytest.fixture(scope="session")
 def scene(tiny_scene: Scene) -> Scene:

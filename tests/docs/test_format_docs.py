@@ -21,7 +21,7 @@ from tests.scene_writers import expose_photos, write_demo
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory, one_torch_thread: None) -> Path:
+def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("docs")
     scene = write_demo(folder / "scene", width=48, height=36, views=10, points=200)
     expose_photos(scene)

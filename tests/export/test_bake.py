@@ -17,8 +17,6 @@ from tests.export.web.support import as_stored, psnr, rendered, ring
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def make_model(residual: bool = True, count: int = 12, sh_degree: int = 1) -> nw.Model:
     scene = random_scene(count, width=64, height=48, seed=3, sh_degree=sh_degree)

@@ -24,8 +24,6 @@ from tests.reference.collect import rotations
 from tests.scenes import make_camera, make_surfels, random_scene
 from tests.tolerances import assert_close
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 @pytest.fixture(scope="module")
 def cameras() -> dict[str, nw.Camera]:

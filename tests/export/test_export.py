@@ -29,8 +29,6 @@ from tests.render_support import rays_of
 from tests.scenes import intrinsics, make_camera, make_surfels, random_scene
 from tests.tolerances import assert_close
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def read(path: Path) -> dict[str, torch.Tensor]:
     """The vertices, by property, as another program sees them."""

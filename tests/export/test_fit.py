@@ -14,7 +14,6 @@ from nexwarp.run.evaluate import psnr
 from nexwarp.train.recipe import TextureConfig
 from tests.tolerances import assert_close
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
 STEPS = 60
 
 

@@ -67,7 +67,6 @@ def drawn(glb: bytes, camera: nw.Camera, turn: np.ndarray) -> torch.Tensor:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
-@pytest.mark.usefixtures("one_torch_thread")
 @pytest.mark.timeout(300)
 def test_three_js_draws_what_is_read_back(tmp_path: Path) -> None:
     """Its tests of depth and alpha, its texture, and which way is up."""

@@ -21,8 +21,6 @@ from tests.scene_writers import exposure_at, with_exposures, write_demo
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
 
 

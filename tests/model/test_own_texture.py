@@ -13,8 +13,6 @@ from nexwarp.train.recipe import DensifyConfig
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.trainer_support import small
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 class Wrapped(nw.Texture):
     """A neural texture behind the protocol."""

@@ -108,7 +108,6 @@ def test_unseen_surfels_get_one_colour_and_none_are_no_trouble(device: torch.dev
         assert torch.equal(a, b)
 
 
-@pytest.mark.usefixtures("one_torch_thread")
 def test_finishing_leaves_the_training_as_it_is(tiny_scene: nw.Scene, device: torch.device) -> None:
     """A model of its own: training goes on as if none had been asked for, on CUDA with graphs recorded anew."""
     texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)

@@ -1,6 +1,5 @@
 import dataclasses
 
-import pytest
 import torch
 from torch.autograd import gradcheck
 
@@ -13,8 +12,6 @@ from nexwarp.train.trainer import Trainer
 from tests.scenes import make_camera, make_surfels, random_scene
 from tests.tolerances import assert_close
 from tests.trainer_support import small
-
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 PINHOLE = ((20.0, 22.0), (9.5, 6.5), (18, 13))  # focal lengths, principal point, size
 

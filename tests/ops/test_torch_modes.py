@@ -1,5 +1,5 @@
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -7,7 +7,6 @@ import torch.utils.checkpoint
 
 import nexwarp as nw
 from nexwarp.kernels import launch
-from nexwarp.machine import deterministic
 from nexwarp.model.buffers import PASSES, render_buffers
 from nexwarp.train.trainer import Trainer
 from tests.narrowing import neural, present
@@ -15,15 +14,9 @@ from tests.render_support import BACKGROUND, BUFFERS, assert_same, cameras, fini
 from tests.tolerances import assert_close
 from tests.trainer_support import assert_same_state, small
 
+pytestmark = pytest.mark.usefixtures("fixed_order")
 SECOND = r"^second derivatives are not supported"
 HALVES = [torch.bfloat16, torch.float16]
-
-
-@pytest.fixture(autouse=True)
-def fixed_order(device: torch.device) -> Iterator[None]:
-    """On CUDA without atomics, whose order differs from one launch to the next."""
-    with deterministic(device.type == "cuda"):
-        yield
 
 
 def model_of(device: torch.device, *, bare: bool = False) -> tuple[nw.Model, nw.Camera]:
@@ -99,7 +92,6 @@ def test_autocast_changes_nothing(dtype, bare, device):
         assert_equal(found, wanted)
 
 
-@pytest.mark.usefixtures("one_torch_thread")
 def test_training_in_inference_mode_or_autocast_is_that_outside(tiny_scene, device):
     runs = [Trainer(tiny_scene, small(deterministic=True), device) for _ in range(2)]
     for i in range(4):

@@ -11,7 +11,6 @@ import torch
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.errors import OutOfMemoryError
-from nexwarp.machine import deterministic
 from nexwarp.model.buffers import PASSES, render_buffers
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
@@ -21,7 +20,7 @@ from tests.render_support import BACKGROUND, assert_same, loss
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.trainer_support import assert_same_state, small
 
-pytestmark = pytest.mark.usefixtures("small_preset")
+pytestmark = pytest.mark.usefixtures("small_preset", "fixed_order")
 
 SMALL = Config(texture=TextureConfig(levels=2, table_size=2**6, width=8), densify=DensifyConfig(every=2), sh_degree=1)
 FLAGS = "--iterations 3 --max-surfels 24 --checkpoint-every 1 --deterministic --set cuda_graphs=false".split()
@@ -31,13 +30,6 @@ FAULTS = [
     "CUDA error: an illegal memory access was encountered\nFor debugging consider passing CUDA_LAUNCH_BLOCKING=1",
     "Warp CUDA error 719: unspecified launch failure (in function wp_cuda_launch_kernel)",
 ]
-
-
-@pytest.fixture(autouse=True)
-def fixed_order(device: torch.device) -> Iterator[None]:
-    """On CUDA without atomics, whose order differs from one launch to the next."""
-    with deterministic(device.type == "cuda"):
-        yield
 
 
 def chosen(count: int, device: torch.device) -> list[int]:

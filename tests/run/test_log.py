@@ -13,8 +13,6 @@ from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 TEXTURE = TextureConfig(levels=4, table_size=2**8, width=16)
 CONFIG = Config(iterations=12, max_surfels=60, texture=TEXTURE, densify=DensifyConfig(every=3))
 CLOCK = ("iterations_per_second", "seconds", "memory_bytes")

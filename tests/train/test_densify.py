@@ -19,8 +19,6 @@ from tests.reference.collect import rotations
 from tests.scenes import make_surfels, random_scene
 from tests.trainer_support import OFTEN, small
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 COPIED = ("raw_quats", "logit_opacities", "raw_gammas", "sh0", "shN")
 MOMENTS = ("exp_avg", "exp_avg_sq")
 

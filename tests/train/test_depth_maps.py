@@ -14,7 +14,6 @@ from tests.narrowing import present
 from tests.tolerances import assert_close
 from tests.trainer_support import assert_resumed_alike, assert_same_state, small, trained
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
 OFF = LossWeights(depth_maps=0.0)
 
 

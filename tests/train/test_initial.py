@@ -11,8 +11,6 @@ from nexwarp.train.recipe import TextureConfig, preset
 from tests.reference.collect import rotations
 from tests.trainer_support import TEXTURE, small
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def test_finest_cells_are_the_pixels_of_nearly_all_views(scene):
     """Against the definition, point by point: the 95th percentile of f / t over what the views see."""

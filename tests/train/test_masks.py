@@ -10,8 +10,6 @@ from nexwarp.train.target import mean_color
 from tests.tolerances import assert_close
 from tests.trainer_support import TEXTURE
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def make_trainer(scene: nw.Scene, **settings) -> nw.Trainer:
     values: dict[str, Any] = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE} | settings

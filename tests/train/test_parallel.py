@@ -39,8 +39,6 @@ from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
 from tests.trainer_support import OFTEN, TEXTURE, small
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 # The command line has no flags for the texture's shape. All ranks estimate exposures alike, and that would take most of
 # the time of so short a training.
 SMALL = Config(exposures=False, texture=TEXTURE, densify=OFTEN)

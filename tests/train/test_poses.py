@@ -25,8 +25,6 @@ from tests.cli.support import FLAGS, SMALL
 from tests.tolerances import assert_close
 from tests.trainer_support import assert_resumed_alike, small, trained
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 # Surfels and texture stay as they are.
 STILL: dict[str, Any] = {f.name: 0.0 for f in dataclasses.fields(LearningRates)}
 STILL |= dict.fromkeys(("means", "grid", "mlp"), (0.0, 0.0))

@@ -23,8 +23,6 @@ from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import TextureConfig
 from nexwarp.train.stages import VIEW_COST, OwnTeachers, StageRunner, divide, plan_teachers, shortened
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 CPU = torch.device("cpu")
 CONFIG = nw.Config(
     iterations=20, max_surfels=60, teachers=2, exposures=False, texture=TextureConfig(levels=4, table_size=1024)

@@ -16,8 +16,6 @@ from nexwarp.train.recipe import TextureConfig
 from tests.ranks_support import alone_as
 from tests.trainer_support import assert_resumed_alike
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 CPU = torch.device("cpu")
 CONFIG = Config(
     iterations=12,

@@ -15,8 +15,6 @@ from tests.scene_writers import with_exposures
 from tests.tolerances import assert_close
 from tests.trainer_support import OFTEN, TEXTURE, assert_resumed_alike, assert_same_state, rescaled, small, trained
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def mean_psnr(trainer: nw.Trainer, views: list[nw.View]) -> float:
     return evaluate(trainer.model(), views)["psnr"]

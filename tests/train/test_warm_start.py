@@ -17,8 +17,6 @@ from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
 from tests.trainer_support import small, trained
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def write_gaussians(path: Path, quats: torch.Tensor, log_scales: torch.Tensor, **changes: torch.Tensor | None) -> None:
     """A file as of 3DGS, with SH of degree 1."""

@@ -17,8 +17,6 @@ from nexwarp.viewer.pacing import BAND_PIXELS, FIRST_PIXELS, MOST_PIXELS, MOST_S
 from nexwarp.viewer.session import Session
 from tests.viewer.support import WATCHED, Client, ring, serving, shown, wait_for
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 WINDOWS = [(1920, 1080), (8192, 8192), (8192, 1), (1, 8192), (1, 1), (8192, 100)]
 
 

@@ -1,5 +1,4 @@
 import io
-import shutil
 import time
 from typing import Any
 
@@ -9,13 +8,8 @@ import torch
 from PIL import Image
 
 from nexwarp.viewer.world import surface_point
+from tests.export.web.support import CHROMIUM, FLAGS
 from tests.viewer.support import serving, wait_for
-
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
-
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")

@@ -11,8 +11,6 @@ from nexwarp.viewer.session import MeasureEditor
 from nexwarp.viewer.world import LEAST_ALPHA, Viewpoint, camera_to_world, surface_point, vertical_fov
 from tests.viewer.support import OPTIONS, Client, serving, wait_for
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def test_a_point_lies_on_the_surface_under_the_click(camera) -> None:
     """On an opaque, tilted surfel: where the click's ray meets its plane, to a pixel."""

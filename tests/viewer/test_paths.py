@@ -23,8 +23,6 @@ from nexwarp.viewer.world import (
 )
 from tests.viewer.support import Client, ring, serving, wait_for
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def test_the_share_of_time_is_kept_whatever_pictures_cost():
     generator = np.random.default_rng(0)

@@ -9,7 +9,6 @@ from nexwarp.run.photo_table import load_photo_table
 from nexwarp.viewer.world import camera_to_world
 from tests.viewer.support import Client, serving, wait_for
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
 HEADER = b"photo,split,psnr,sharpness\n"
 DAMAGED = [
     b"", b"photo\n", b"\xff\xfe", HEADER + b"a,train\n", HEADER + b"a,train,x,1\n", HEADER + b"a,train,nan,1\n",

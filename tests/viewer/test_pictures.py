@@ -11,8 +11,6 @@ from nexwarp.viewer.world import Viewpoint, camera_to_world, vertical_fov
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.viewer.support import OPTIONS
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def drawn(model: nw.Model, bands: Sequence[nw.Camera], settings: Settings) -> Picture:
     """The picture; none is given up."""

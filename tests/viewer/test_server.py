@@ -7,8 +7,6 @@ import pytest
 from tests.cli.support import refused
 from tests.viewer.support import Client, serving, wait_for
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def test_one_line_for_what_cannot_be_shown(run, tiny_folder, tmp_path, capsys, monkeypatch):
     refused(capsys, ["view", str(tmp_path / "none")], str(tmp_path / "none"), "expected a run folder")

@@ -13,8 +13,6 @@ from tests.scenes import make_surfels, make_texture, random_scene
 from tests.trainer_support import assert_same_state, small
 from tests.viewer.support import OPTIONS, WATCHED, Client, ring, wait_for
 
-pytestmark = pytest.mark.usefixtures("one_torch_thread")
-
 
 def test_looking_changes_nothing_about_a_training(tiny_scene):
     pytest.importorskip("viser")
