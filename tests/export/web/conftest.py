@@ -1,5 +1,3 @@
-"""A page of a small model, and tabs of a browser that show it."""
-
 import functools
 from collections.abc import Callable, Iterator
 from typing import Any

@@ -1,5 +1,3 @@
-"""What a page says beside its scene: title, caption, background, notes and the preview of links to it."""
-
 import json
 import re
 from dataclasses import dataclass

@@ -1,5 +1,3 @@
-"""The web page in a browser: loading, controls, links, touch, damaged files, and the baked scene against Python."""
-
 import html
 import json
 import re
@@ -31,7 +29,6 @@ TARGET = "(p => p.eye.map((x, i) => x + p.distance * p.axes().forward[i]))(nexwa
 
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"),
-    pytest.mark.usefixtures("one_torch_thread"),
     pytest.mark.timeout(300),
 ]
 

@@ -1,5 +1,3 @@
-"""Scene files, and the page as one file or a folder: what comes back, what damaged files say, what a page holds."""
-
 import base64
 import json
 import re

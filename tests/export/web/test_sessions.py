@@ -13,7 +13,6 @@ from tests.export.web.support import CHROMIUM, FINISHED, POSE, PageTab, psnr
 
 pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"),
-    pytest.mark.usefixtures("one_torch_thread"),
     pytest.mark.timeout(300),
 ]
 SIZE = (96, 80)  # of an eye, pixels
