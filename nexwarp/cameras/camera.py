@@ -106,7 +106,9 @@ class Camera:
 
     def project(self, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return pixel coordinates (N, 2) and z-depths (N,) of world points (N, 3), of those behind the camera too."""
-        x = (points[:, None] * self.viewmat[:3, :3]).sum(-1) + self.viewmat[:3, 3]  # not a product: see `position`
+        # Not a matrix product: see `position`. A product of all with all, then summed, took four times as long.
+        a, b, c = (points[:, axis, None] * self.viewmat[:3, axis] for axis in range(3))
+        x = a + b + c + self.viewmat[:3, 3]
         depths = x[:, 2]
         columns, rows = self.fx * x[:, 0] / depths + self.cx, self.fy * x[:, 1] / depths + self.cy
         return torch.stack([columns, rows], dim=-1), depths
