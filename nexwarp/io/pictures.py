@@ -261,9 +261,10 @@ def error_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
     Returns (H, W, 3) uint8: viridis from 0 (dark violet) to 0.25 and above (yellow), in 256 steps.
     """
-    sums = (_shown("image", image).short() - _shown("target", target)).abs().sum(-1)
+    first, second = _shown("image", image), _shown("target", target)
+    red, green, blue = (torch.maximum(first, second) - torch.minimum(first, second)).unbind(-1)
     steps = (torch.arange(3 * 255 + 1) / (3 * ERROR_SCALE)).round().clamp(max=255.0).long()
-    return to_uint8(viridis())[steps][sums]
+    return to_uint8(viridis())[steps][red.int() + green + blue]
 
 
 def side_by_side(images: Sequence[torch.Tensor], gap: int = 4, captions: Sequence[str] | None = None) -> torch.Tensor:
