@@ -4,6 +4,7 @@ import random
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.model.buffers import PASSES, render_buffers
+from nexwarp.model.graphs import StepGraphs, UpdateError
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.trainer import Trainer
 from tests.faults import failing_gpu
@@ -88,6 +90,18 @@ def test_a_training_that_lacks_memory_goes_on_from_a_snapshot(tiny_scene, device
             run.run(until=STEPS)
         assert_same_state(run, expected)
     assert failed > 5
+
+
+def test_an_update_that_lacks_memory_is_not_repeated(tiny_scene, device, monkeypatch):
+    """It would move some of the parameters twice. Graphs that hold memory allow to repeat other work."""
+    trainer, full = Trainer(tiny_scene, small(), device), torch.OutOfMemoryError("Tried to allocate 2.00 GiB.")
+    monkeypatch.setattr(trainer.optimizer, "step", Mock(side_effect=[full, RuntimeError("no driver")]))
+    with pytest.raises(UpdateError, match=r"while the parameters were updated: needed 2\.00 GiB") as caught:
+        trainer._update(None)
+    holding = Mock(keeper=1)
+    assert StepGraphs.can_repeat(holding, full) and not StepGraphs.can_repeat(holding, caught.value)
+    with pytest.raises(RuntimeError, match=r"^no driver$"):
+        trainer._update(None)
 
 
 @contextmanager
