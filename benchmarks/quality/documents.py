@@ -4,7 +4,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from benchmarks.quality.jobs import DEFAULT, ITERATIONS, PEERS, SCENES, SIZE
+from benchmarks.quality.jobs import DEFAULT, ITERATIONS, PEERS, RAW, RAW_PEER, SCENES, SIZE
 from benchmarks.quality.results import Results
 
 # A block stands between the lines <!-- results: NAME --> and <!-- end of results -->.
@@ -56,18 +56,20 @@ def figures(cell: Cell) -> str:
 
 
 def readme(results: Results) -> str:
-    """Return the README's table: 40,000 primitives beside the best gsplat row of each scene."""
-    metrics = {"psnr": 2, "ssim": 4, "flip": 4, "megabytes": 1}
+    """Return the README's table: 40,000 primitives, raw with LPIPS, and PSNR of the default and gsplat's best row."""
+    metrics = {"psnr": 2, "ssim": 4, "lpips": 3}
     lines: list[list[str]] = []
     shown: list[Mapping[str, Any]] = []
     for scene in SCENES:
+        own, peer = (cell_of(results, scene, row, SIZE) for row in (RAW.name, RAW_PEER.name))
+        exposed = (cell_of(results, scene, DEFAULT.name, SIZE), best_peer(results, scene, SIZE))
         cells = [scene]
-        for cell in (cell_of(results, scene, DEFAULT.name, SIZE), best_peer(results, scene, SIZE)):
-            cells += [f"{mean(cell, m):.{n}f}" for m, n in metrics.items()] if cell else [MISSING, "", "", ""]
-            shown += cell
+        for cell in (own, peer):
+            cells += [f"{mean(cell, m):.{n}f}" for m, n in metrics.items()] if cell else [MISSING, "", ""]
+        cells += [f"{mean(cell, 'psnr'):.2f}" if cell else MISSING for cell in exposed]
+        shown += [result for cell in (own, peer, *exposed) for result in cell]
         lines.append(cells)
-    columns = ["SSIM", "FLIP", "MB"]
-    header = ["scene", "nexwarp: PSNR [dB]", *columns, "gsplat: PSNR [dB]", *columns]
+    header = ["scene", "nexwarp: PSNR", "SSIM", "LPIPS", "gsplat: PSNR", "SSIM", "LPIPS", "default: PSNR", "best: PSNR"]
     return f"{markdown(header, lines)}\n\n{caption(shown)}"
 
 

@@ -35,10 +35,11 @@ RAW = Row("raw", "default", {"exposures": False})  # as published tables are
 # gsplat as its examples have it, and with what our default has and they lack.
 _BACKGROUND = {"background": True}
 _EXPOSED = _BACKGROUND | {"exposures": True}
+RAW_PEER = Row("gsplat MCMC, raw", None, _BACKGROUND | {"even_start": True, "skybox": 100})
 PEERS = (
     Row("gsplat MCMC", None),
     Row("gsplat MCMC, background", None, _BACKGROUND),
-    Row("gsplat MCMC, raw", None, _BACKGROUND | {"even_start": True, "skybox": 100}),
+    RAW_PEER,
     Row("gsplat MCMC, exposures", None, _EXPOSED),
     Row("gsplat MCMC, even start", None, _EXPOSED | {"even_start": True}),
     Row("gsplat MCMC, skybox", None, _EXPOSED | {"even_start": True, "skybox": 100}),
