@@ -68,9 +68,9 @@ def directions(count: int) -> torch.Tensor:
 
 
 def _looks(views: Sequence[View], points: torch.Tensor, cloud: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Return the sums (N, 3) of the colours in [0, 1] at which views show points (N, 3), and how many (N,) do.
+    """Return what views show of points (N, 3): sums (N, 3) of colours in [0, 1] and numbers (N,) of views.
 
-    And how many (N,) of these show no point of the cloud (M, 3) near it.
+    The third, (N,), is how many of these views show no point of the cloud (M, 3) near it.
     """
     sums, seen = torch.zeros(len(points), 3, dtype=torch.float64), torch.zeros(len(points), dtype=torch.int64)
     empty = torch.zeros_like(seen)

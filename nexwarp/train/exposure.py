@@ -68,7 +68,7 @@ class Observations(NamedTuple):
     """M observations of P points in photos, point by point."""
 
     view: np.ndarray  # (M,) index of the photo
-    point: np.ndarray  # (M,) index of the point, which never falls
+    point: np.ndarray  # (M,) index of the point, ascending
     color: np.ndarray  # (3, M) log colour
     squares: np.ndarray  # (M,) squared tangent of the angle to the optical axis
     places: np.ndarray  # (P, 3) positions of the points, float32
