@@ -92,11 +92,12 @@ def fixed_order(device: torch.device) -> Iterator[None]:
 
 
 @pytest.fixture
-def restore_launch_threads() -> Iterator[None]:
-    """Whatever a test sets, the passes on a CPU use as many threads as before."""
-    before = launch.get_num_threads()
+def restore_threads() -> Iterator[None]:
+    """Whatever a test sets, the passes on a CPU and torch use as many threads as before."""
+    kernels, others = launch.get_num_threads(), torch.get_num_threads()
     yield
-    launch.set_num_threads(before)
+    launch.set_num_threads(kernels)
+    torch.set_num_threads(others)
 
 
 @pytest.fixture(scope="session")

@@ -42,11 +42,11 @@ def assert_alike(actual: Any, expected: Any, buffers: tuple[str, ...] = BUFFERS)
         assert_close(getattr(actual, name), getattr(expected, name), kind="value", name=name)
 
 
-def loss(out: Any) -> torch.Tensor:
-    """Sum of all differentiable buffers with fixed random factors."""
+def loss(out: Any, buffers: tuple[str, ...] = BUFFERS) -> torch.Tensor:
+    """Sum of differentiable buffers with fixed random factors."""
     generator = torch.Generator().manual_seed(7)
-    total = out.image.new_zeros(())
-    for name in BUFFERS:
+    total = getattr(out, buffers[0]).new_zeros(())
+    for name in buffers:
         buffer = getattr(out, name)
         total = total + (buffer * torch.randn(buffer.shape, generator=generator, dtype=torch.float64).to(buffer)).sum()
     return total

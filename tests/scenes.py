@@ -13,14 +13,12 @@ from typing import Any
 import torch
 
 import nexwarp as nw
+from nexwarp.model.surfels import Activated
 from tests.reference.collect import rotations
 
 Scene = dict[str, Any]
 SURFEL_KEYS = ("means", "quats", "scales", "opacities", "gammas", "sh")
 CAMERA_KEYS = ("viewmat", "K", "width", "height", "near")
-
-# Means, quats, scales, opacities and gammas.
-Shape = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 def uniform(generator: torch.Generator, *shape: int, low: float = 0.0, high: float = 1.0) -> torch.Tensor:
@@ -151,16 +149,6 @@ def named_scene(name: str, dtype: torch.dtype, device: torch.device | str) -> Sc
     return scene
 
 
-def moved_scene(scene: Scene, quat: tuple[float, ...], translation: tuple[float, ...]) -> Scene:
-    """Apply a rigid motion to the surfels and the camera of a scene."""
-    motion = rigid(quat, translation).to(scene["means"])
-    return scene | {
-        "means": scene["means"] @ motion[:3, :3].T + motion[:3, 3],
-        "quats": multiply(torch.tensor([quat], dtype=torch.float64).to(scene["quats"]), scene["quats"]),
-        "viewmat": scene["viewmat"] @ motion.inverse(),
-    }
-
-
 def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Hamilton product (N, 4), wxyz."""
     aw, ax, ay, az = a.unbind(-1)
@@ -178,10 +166,9 @@ def make_surfels(scene: Scene) -> nw.Surfels:
     return nw.Surfels.from_activated(*(scene[key] for key in SURFEL_KEYS))
 
 
-def detached_shape(surfels: nw.Surfels) -> Shape:
+def detached_shape(surfels: nw.Surfels) -> Activated:
     """Return the activated geometry without its history."""
-    means, quats, scales, opacities, gammas = surfels.activated()
-    return means.detach(), quats.detach(), scales.detach(), opacities.detach(), gammas.detach()
+    return Activated(*(x.detach() for x in surfels.activated()))
 
 
 def make_camera(scene: Scene, **changes: Any) -> nw.Camera:

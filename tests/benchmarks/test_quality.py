@@ -3,7 +3,6 @@ import json
 from pathlib import Path
 
 import pytest
-import torch
 
 import nexwarp as nw
 from benchmarks.quality.__main__ import main
@@ -28,8 +27,8 @@ def test_validation_views_are_training_views(folder: Path) -> None:
     assert sorted(view.name for fold in folds for view in fold.test) == names
 
 
+@pytest.mark.usefixtures("restore_threads")
 def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    threads = torch.get_num_threads()
     settings = {"texture.levels": 4, "texture.table_size": 1024}
     out = tmp_path / "out.jsonl"
     command = ["train", "--row", f"mine:default:{json.dumps(settings)}", "--scenes", "tiny", "--seeds", "0"]
@@ -51,7 +50,6 @@ def test_a_training_is_done_once(folder: Path, tmp_path: Path, capsys: pytest.Ca
         main([word.replace("mine:", "paper:") for word in command])
     assert main(["table", str(out)]) == 0
     assert "| tiny, photos reduced by 2 | 60 | 4 | mine |" in capsys.readouterr().out
-    torch.set_num_threads(threads)
 
 
 def test_the_documents_have_the_kept_figures(tmp_path: Path) -> None:

@@ -28,8 +28,11 @@ def test_motions_follow_each_other_and_lead_back():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_moved_surfels_look_the_same_to_the_moved_camera(dtype):
-    """Shape, harmonics of all degrees and order; depths are in the new units, normals in the new axes."""
-    scene = random_scene(dtype=dtype)
+    """Shape, harmonics of all degrees and order; depths are in the new units, normals in the new axes.
+
+    The near plane lies amid the surfels.
+    """
+    scene = random_scene(dtype=dtype) | {"near": 2.5}
     surfels, camera = make_surfels(scene), make_camera(scene)
     with torch.no_grad():
         before = nw.render(surfels, None, camera)

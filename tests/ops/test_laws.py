@@ -11,7 +11,6 @@ from tests.scenes import (
     make_camera,
     make_surfels,
     make_texture,
-    moved_scene,
     random_scene,
 )
 from tests.tolerances import assert_close, assert_same_ids
@@ -25,23 +24,6 @@ def test_the_order_of_the_surfels_changes_nothing(device: torch.device) -> None:
     assert_same(other, out)
     mapped = torch.where(other.ids >= 0, permutation[other.ids.clamp_min(0).long()], -1)
     assert torch.equal(mapped, out.ids.long())
-
-
-def test_moving_scene_and_camera_together_changes_nothing(device: torch.device) -> None:
-    scene = random_scene(sh_degree=0, dtype=torch.float64, device=device)
-    assert_alike(draw(moved_scene(scene, (0.3, -0.7, 0.4, 0.5), (3.0, -1.0, 2.0)), max_hits=4), draw(scene, max_hits=4))
-
-
-def test_scaling_the_world_scales_depths_only(device: torch.device) -> None:
-    scene = random_scene(dtype=torch.float64, device=device)
-    scene["near"] = 2.5
-    factor = 37.0
-    viewmat = scene["viewmat"].clone()
-    viewmat[:3, 3] *= factor
-    scaled = scene | {name: factor * scene[name] for name in ("means", "scales", "near")} | {"viewmat": viewmat}
-    out, expected = draw(scaled), draw(scene)
-    assert_alike(out, expected, ("image", "plain", "textured", "weights", "alpha"))
-    assert_close(out.depths / factor, expected.depths, kind="value", name="depths")
 
 
 def test_without_texture_max_hits_does_not_matter(device: torch.device) -> None:

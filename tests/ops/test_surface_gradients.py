@@ -1,7 +1,3 @@
-import functools
-import importlib
-from typing import Any
-
 import pytest
 import torch
 
@@ -9,7 +5,7 @@ import nexwarp as nw
 from tests.narrowing import present
 from tests.reference.collect import Shape
 from tests.reference.surface import Surface, surface
-from tests.render_support import assert_gradients, rigid_gradient, twin, view_of
+from tests.render_support import assert_gradients, loss, rigid_gradient, twin, view_of
 from tests.scenes import make_camera, make_surfels, make_texture, named_scene, random_scene
 from tests.tolerances import FLIPS, assert_close
 
@@ -20,16 +16,6 @@ GEOMETRY = ("means", "quats", "scales", "opacities", "gammas")
 def reference(tensors: dict[str, torch.Tensor], camera: nw.Camera) -> Surface:
     """Hand tensors in float64 on the CPU to the reference."""
     return surface(Shape(*(tensors[name] for name in GEOMETRY)), tensors["viewmat"], view_of(camera))
-
-
-def loss(out: Any, buffers: tuple[str, ...] = BUFFERS) -> torch.Tensor:
-    """Sum of the buffers with fixed random factors."""
-    generator = torch.Generator().manual_seed(7)
-    total = getattr(out, buffers[0]).new_zeros(())
-    for name in buffers:
-        buffer = getattr(out, name)
-        total = total + (buffer * torch.randn(buffer.shape, generator=generator, dtype=torch.float64).to(buffer)).sum()
-    return total
 
 
 @pytest.mark.parametrize("name", ["random", "layered", "off_centre", "specks"])
@@ -66,26 +52,6 @@ def test_gradients_of_the_reference_agree_with_differences() -> None:
     assert buffers(*inputs)[-1].max() > 0.01 and torch.autograd.gradcheck(buffers, inputs, fast_mode=True)
 
 
-def test_a_rendering_walks_once_until_a_surface_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither a rendering nor its backward pass launches a kernel of the surface."""
-    launched: list[str] = []
-    module = importlib.import_module("nexwarp.ops.surface")
-    kernels = {name: getattr(module, name) for name in ("surface_kernel", "surface_backward_kernel")}
-
-    def noted(name: str, *arguments: Any) -> Any:
-        launched.append(name)
-        return kernels[name](*arguments)
-
-    for name in kernels:
-        monkeypatch.setattr(module, name, functools.partial(noted, name))
-    scene = random_scene()
-    out = nw.render(make_surfels(scene), make_texture(), make_camera(scene))
-    out.image.sum().backward(retain_graph=True)
-    assert not launched
-    (out.normals.sum() + out.expected_depth.sum()).backward()
-    assert len(launched) == 2
-
-
 @pytest.mark.cuda
 def test_gradients_repeat_bit_for_bit() -> None:
     """Thousands of overlapping surfels, half precision: with torch's deterministic algorithms all bits repeat."""
@@ -101,7 +67,7 @@ def test_gradients_repeat_bit_for_bit() -> None:
             request = out.request_splat_error(out.alpha.detach())
             image, parameters = out.image.square().sum(), [*surfels.parameters(), *texture.parameters()]
             grads = torch.autograd.grad(image + out.weights.square().sum(), parameters, retain_graph=True)
-            of_surface = torch.autograd.grad(loss(out), [*geometry, camera.viewmat])
+            of_surface = torch.autograd.grad(loss(out, BUFFERS), [*geometry, camera.viewmat])
             sums = present(request.sums_after_backward), out.splat_error(out.alpha.detach())
             found.append([*grads, *of_surface, *sums])
     finally:

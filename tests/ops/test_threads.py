@@ -13,7 +13,7 @@ from tests.scene_writers import write_demo
 from tests.scenes import Scene, layered_scene, make_texture, random_scene
 from tests.tolerances import assert_close
 
-pytestmark = pytest.mark.usefixtures("restore_launch_threads")
+pytestmark = pytest.mark.usefixtures("restore_threads")
 
 BIG = {"width": 61, "height": 45}
 # 19 x 13 tiles: a sixteenth of their pixels is no whole number of tiles, which once split a tile between two threads.
@@ -101,18 +101,15 @@ def test_training_does_not_depend_on_threads(tmp_path):
     scene = nw.load_scene(write_demo(tmp_path / "scene", width=96, height=72, views=4, points=500))
     texture = TextureConfig(levels=12, table_size=2**12, width=32)
     config = Config(iterations=40, max_surfels=2000, texture=texture, densify=DensifyConfig(every=3))
-    before, models = torch.get_num_threads(), []
-    try:
-        for kernels, others in ((1, 1), (2, 3), (3, 4)):
-            launch.set_num_threads(kernels)
-            torch.set_num_threads(others)
-            trainer = Trainer(scene, config, "cpu")
-            for _ in range(4):
-                trainer.step()
-            models.append(dict(trainer._named_parameters()) | {"errors": trainer.densifier.errors})
-            assert torch.get_num_threads() == others
-    finally:
-        torch.set_num_threads(before)
+    models = []
+    for kernels, others in ((1, 1), (2, 3), (3, 4)):
+        launch.set_num_threads(kernels)
+        torch.set_num_threads(others)
+        trainer = Trainer(scene, config, "cpu")
+        for _ in range(4):
+            trainer.step()
+        models.append(dict(trainer._named_parameters()) | {"errors": trainer.densifier.errors})
+        assert torch.get_num_threads() == others
     assert_identical([{name: x.detach() for name, x in model.items()} for model in models])
 
 
@@ -124,26 +121,19 @@ def test_many_points_in_one_pixel_add_up_in_order():
     row, column = torch.randint(40, (count,), generator=generator), torch.randint(3, (count,), generator=generator)
     places = (row * 30 + column).sort().values
     expected = 1 + torch.rand(count, generator=generator)
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 4, 4, 7):
-            torch.set_num_threads(threads)
-            weights = torch.full(shape, 0.3, requires_grad=True)
-            depth_term(depths, weights, expected, places).backward()
-            results.append({"weights": present(weights.grad)})
-    finally:
-        torch.set_num_threads(before)
+    results = []
+    for threads in (1, 4, 4, 7):
+        torch.set_num_threads(threads)
+        weights = torch.full(shape, 0.3, requires_grad=True)
+        depth_term(depths, weights, expected, places).backward()
+        results.append({"weights": present(weights.grad)})
     assert_identical(results)
 
 
 def test_threads_of_small_work_have_one_torch_thread_each_and_keep_the_order():
-    before = torch.get_num_threads()
     torch.set_num_threads(3)
-    try:
-        nested = list(in_threads(lambda i: (i, torch.get_num_threads(), *in_threads(int, [i])), range(40)))
-        assert nested == [(i, 1, i) for i in range(40)]
-        with pytest.raises(ZeroDivisionError):
-            list(in_threads(lambda i: 1 / i, [1, 0, 2]))
-        assert torch.get_num_threads() == 3
-    finally:
-        torch.set_num_threads(before)
+    nested = list(in_threads(lambda i: (i, torch.get_num_threads(), *in_threads(int, [i])), range(40)))
+    assert nested == [(i, 1, i) for i in range(40)]
+    with pytest.raises(ZeroDivisionError):
+        list(in_threads(lambda i: 1 / i, [1, 0, 2]))
+    assert torch.get_num_threads() == 3

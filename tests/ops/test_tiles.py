@@ -10,7 +10,7 @@ from tests.scenes import facing_scene, random_scene
 from tests.tolerances import assert_close
 
 
-@pytest.mark.usefixtures("restore_launch_threads")
+@pytest.mark.usefixtures("restore_threads")
 @pytest.mark.parametrize("room", [0, 3, 10_000])
 def test_too_little_or_too_much_room_changes_nothing(room: int, device: torch.device) -> None:
     # Without room, walks go over all surfels, and a CPU's gradients straight to these, without atomics: by one thread.

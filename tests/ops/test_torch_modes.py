@@ -41,7 +41,7 @@ def assert_equal(actual: dict[str, torch.Tensor], expected: dict[str, torch.Tens
     assert not different, different
 
 
-@pytest.mark.usefixtures("restore_launch_threads")
+@pytest.mark.usefixtures("restore_threads")
 @pytest.mark.parametrize("threads", [1, 2, 3])
 def test_inference_mode_gives_the_bits_of_no_grad(threads, device):
     launch.set_num_threads(threads)
