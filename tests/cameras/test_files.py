@@ -98,16 +98,6 @@ def test_a_file_of_nerfstudios_viewer(tmp_path: Path) -> None:
     assert one.viewmat.equal(torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
 
 
-def test_intrinsics_stand_in_the_file_or_the_frame(tmp_path: Path) -> None:
-    frames = [FRAME, FRAME | {"file_path": "b.png", "fl_x": 70.0, "fl_y": 71.0, "cx": 3.5, "w": 100}]
-    a, b = load_camera_path(written(tmp_path, SCENE | {"frames": frames})).cameras
-    assert (a.fx, a.fy, a.cx, a.cy, a.width, a.height) == (50, 50, 32, 24, 64, 48)
-    assert (b.fx, b.fy, b.cx, b.cy, b.width, b.height) == (70, 71, 3.5, 24, 100, 48)
-    blender = {"camera_angle_x": math.pi / 2, "w": 64, "h": 48, "frames": [FRAME]}
-    (c,) = load_camera_path(written(tmp_path, blender)).cameras
-    assert c.fx == c.fy == pytest.approx(32.0)
-
-
 def test_applied_transform_and_scale_are_taken_back(tmp_path: Path) -> None:
     before = {str(i): each for i, each in enumerate(cameras(3))}
     save_transforms(tmp_path / "a.json", before)

@@ -33,6 +33,10 @@ def refuses(tmp_path, capsys) -> Callable[..., None]:
         (["--device", "gpu"], ["--device", "expected cuda or cpu", "'gpu'"]),
         (["--format", "blender"], ["expected transforms_train.json of a Blender scene"]),
         (["--resume"], ["new", "expected a run to resume"]),
+        (["--set", "texture.levels=many"], ['--set: texture.levels: expected an integer, got "many"']),
+        (["--set", "preset=paper"], ["--set: preset: expected --preset instead"]),
+        (["--seed", "1", "--set", "seed=1"], ["--set: seed: expected --seed instead"]),
+        (["--set", "seed=1", "--set", "seed=2"], ["--set: seed: expected it once"]),
     ],
 )
 def test_flags_that_cannot_be(scene, refuses, flags, words):

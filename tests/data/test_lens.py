@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from nexwarp.data.lens import FACES, MAX_PARAMETER, MIN_FOCAL, Lens, pycolmap_module, undistortion
+from nexwarp.data.lens import MAX_PARAMETER, MIN_FOCAL, Intrinsics, Lens, pycolmap_module, undistortion
+from tests.data.inputs.room import pinhole_rays
 
 WIDTH, HEIGHT = 120, 90
 F = (80.0, 83.0, 61.5, 43.0)  # fx, fy, cx, cy
@@ -28,15 +29,14 @@ LENSES = {
 }
 
 
+def rays_of(target: Intrinsics) -> np.ndarray:
+    """(h * w, 3) rays through the pixel centres of a pinhole image."""
+    pinhole = target.fx, target.fy, target.cx, target.cy
+    return pinhole_rays(pinhole, target.width, target.height).reshape(-1, 3)
+
+
 def lens(model: str) -> Lens:
     return Lens(model, LENSES[model], WIDTH, HEIGHT)
-
-
-def rays_of(target) -> np.ndarray:
-    """(h * w, 3) rays through the pixel centres of a pinhole image."""
-    pixels = np.stack(np.meshgrid(np.arange(target.width) + 0.5, np.arange(target.height) + 0.5), axis=-1)
-    flat = (pixels.reshape(-1, 2) - [target.cx, target.cy]) / [target.fx, target.fy]
-    return np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
 
 
 def test_every_model_that_colmap_has_is_here():
@@ -94,31 +94,6 @@ def test_masks_take_the_nearest_pixel_and_end_with_the_photo():
     left = pixels[:, 0] < WIDTH // 2 - 1e-3
     assert not out[outside].any() and (out[inside & left]).all()
     assert not out[inside & (pixels[:, 0] > WIDTH // 2 + 1e-3)].any() and 0.1 < inside.mean() < 0.5
-
-
-def test_the_faces_of_a_panorama_show_their_directions():
-    """A panorama whose colours are directions, x right, y down, z forward at its centre."""
-    size = 512, 256
-    longitude = ((np.arange(size[0]) + 0.5) / size[0] - 0.5) * 2 * np.pi
-    latitude = ((np.arange(size[1]) + 0.5) / size[1] - 0.5) * np.pi
-    x = np.sin(longitude) * np.cos(latitude)[:, None]
-    z = np.cos(longitude) * np.cos(latitude)[:, None]
-    y = np.sin(latitude)[:, None] + 0 * longitude
-    photo = torch.from_numpy(np.round(127.5 + 127.5 * np.stack([x, y, z], axis=-1)).astype(np.uint8))
-    sphere = Lens("EQUIRECTANGULAR", tuple(map(float, size)), *size)
-    target = sphere.undistorted()
-    assert target.width == target.height == round(size[0] / np.pi)
-    covered = np.zeros(3)
-    for face, rows in FACES.items():
-        rotation = np.array(rows, float)
-        assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) == pytest.approx(1)
-        rays = rays_of(target) @ rotation
-        directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        way = undistortion(sphere, target, face)
-        assert np.abs(way.colors(photo).reshape(-1, 3).double().numpy() / 127.5 - 1 - directions).max() < 0.02, face
-        assert way.valid is None
-        covered += rotation[2]
-    assert np.abs(covered).max() == 0
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,4 @@
 import dataclasses
-import inspect
 import itertools
 from pathlib import Path
 from typing import Any
@@ -158,19 +157,6 @@ def test_rendering_changes_nothing(device: torch.device) -> None:
     assert model.state_dict().keys() == before.keys()
     for name, x in model.state_dict().items():
         assert torch.equal(x, before[name]), name
-
-
-def test_four_functions_lead_to_the_first_op(monkeypatch: pytest.MonkeyPatch) -> None:
-    package, activate, paths = Path(nw.__file__).parent, ops.activate, []
-
-    def spy(*arguments: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        ours = [f.function for f in inspect.stack()[1:] if package in Path(f.filename).parents]
-        paths.append(ours)
-        return activate(*arguments)
-
-    monkeypatch.setattr(ops, "activate", spy)
-    full_model().render(cameras_of()[0])
-    assert paths == [["activated", "draw", "render", "render"]]
 
 
 def test_nothing_is_rendered_twice(monkeypatch: pytest.MonkeyPatch) -> None:

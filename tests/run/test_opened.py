@@ -53,9 +53,9 @@ def test_photos_that_are_met_exactly_leave_no_infinity(model, tiny_folder, tmp_p
     assert capsys.readouterr().out.count("inf dB") == 2
 
 
-def test_a_trainer_saves_what_the_commands_open_and_what_it_restores(tiny_folder: Path, tmp_path: Path) -> None:
-    scene, config = nw.load_scene(tiny_folder), small(iterations=4)
-    trainer = Trainer(scene, config, "cpu")
+def test_a_trainer_saves_what_the_commands_open(tiny_folder: Path, tmp_path: Path) -> None:
+    scene = nw.load_scene(tiny_folder)
+    trainer = Trainer(scene, small(iterations=4), "cpu")
     trainer.run(until=2)
     folder = tmp_path / "new" / "folder"
     trainer.save(folder)
@@ -65,11 +65,6 @@ def test_a_trainer_saves_what_the_commands_open_and_what_it_restores(tiny_folder
     assert near_depth(opened.model) == pytest.approx(scene.train[0].camera.near)
     assert cli.main(["render", str(folder), "--set", "test", "--device", "cpu"]) == 0
     assert cli.main(["eval", str(folder), "--scene", str(tiny_folder), "--device", "cpu"]) == 0
-    again = Trainer(scene, config, "cpu")
-    again.restore(folder)
-    for each in (trainer, again):
-        each.run()
-    assert torch.equal(trainer.surfels.means, again.surfels.means)
 
 
 def test_the_ring_around_a_scene_sees_its_middle() -> None:

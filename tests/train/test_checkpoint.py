@@ -5,10 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nexwarp.data import Scene
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, load_checkpoint, save_checkpoint
-from nexwarp.train.trainer import Trainer
-from tests.trainer_support import small
 
 
 def save_number(run: Path, number: int) -> None:
@@ -64,23 +61,3 @@ def test_every_flipped_bit_and_every_length_is_found(tmp_path, name):
             assert name == "state.json" and state == {"iteration": 2}, bad
     file.write_bytes(content + b"\0")
     assert load_checkpoint(tmp_path)[1] == {"iteration": 1}
-
-
-def test_a_state_that_no_training_can_have_is_refused(tiny_scene: Scene, tmp_path: Path) -> None:
-    """No surfels; and generators whose next number would lie behind their numbers, which torch does not check."""
-    trainer = Trainer(tiny_scene, small(), "cpu")
-    trainer.run(until=2)
-    snapshot = trainer.snapshot()
-    empty = {name: x[:0] for name, x in snapshot.tensors.items() if name.startswith("surfels.")}
-    changes: list[tuple[dict[str, torch.Tensor], str]] = [(empty, "at least one surfel")]
-    for name in ("rng.views", "rng.noise", "rng.torch"):
-        state = snapshot.tensors[name].clone()
-        state[8:12] = torch.tensor([112, 2, 0, 0])  # 624 numbers left
-        state[16:24] = torch.tensor([112, 2, 0, 0, 0, 0, 0, 0])  # behind the 624th one
-        changes.append(({name: state}, f"{name}: expected a position in 624 numbers, got 624 with 624 left"))
-    for change, message in changes:
-        save_checkpoint(tmp_path, snapshot.tensors | change, snapshot.state)
-        with pytest.raises(ValueError, match=message):
-            trainer.restore(tmp_path)
-    save_checkpoint(tmp_path, *snapshot)
-    trainer.restore(tmp_path)

@@ -160,10 +160,19 @@ def test_too_little_memory_says_what_to_lower(scene, tiny_folder, tmp_path, monk
     assert err.startswith("nexwarp: error: out of memory at iteration 1: it needed 2.50 GiB") and err.count("\n") == 1
 
 
+def beyond_the_last(state: torch.Tensor) -> torch.Tensor:
+    """A generator's state whose next number lies behind its 624 numbers, which torch does not check."""
+    state[8:12] = torch.tensor([112, 2, 0, 0])  # 624 numbers left
+    state[16:24] = torch.tensor([112, 2, 0, 0, 0, 0, 0, 0])  # behind the 624th one
+    return state
+
+
 @pytest.mark.parametrize(
     ("name", "change", "match"),
     [
         ("iteration", lambda _: -1, "iteration"),
+        ("surfels.", lambda x: x[:0], "at least one surfel"),
+        *((f"rng.{x}", beyond_the_last, rf"rng\.{x}: .* 624 left") for x in ("views", "noise", "torch")),
         ("order", lambda _: [0, 77], "order"),
         ("surfels.means", lambda x: x.half(), "float32"),
         ("surfels.means", lambda x: x[:-1], ""),

@@ -17,7 +17,6 @@ from nexwarp.cli import session
 from nexwarp.errors import RankError, SceneError, SettingError
 from nexwarp.machine import derived_seed
 from nexwarp.model.model_file import MODEL_FILE
-from nexwarp.train import recipe
 from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.parallel import MOST_CAPTURED_BYTES, ParallelTrainer, scale_for_batch, sums_beside
 from nexwarp.train.ranks.ranks import WAIT_VARIABLE, Ranks, check_count
@@ -38,6 +37,8 @@ from tests.ranks_support import (
 from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
 from tests.trainer_support import OFTEN, TEXTURE, small
+
+pytestmark = pytest.mark.usefixtures("small_preset")
 
 # The command line has no flags for the texture's shape. All ranks estimate exposures alike, and that would take most of
 # the time of so short a training.
@@ -194,12 +195,7 @@ def test_gpus_that_are_not_there_are_refused(capsys: pytest.CaptureFixture[str])
     refused(capsys, ["train", "demo", "--gpus", "4"], message)
 
 
-@pytest.fixture
-def small_default(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(recipe.PRESETS, "default", SMALL)
-
-
-def test_a_killed_rank_ends_all_and_the_run_resumes(tiny_folder: Path, tmp_path: Path, small_default: None) -> None:
+def test_a_killed_rank_ends_all_and_the_run_resumes(tiny_folder: Path, tmp_path: Path) -> None:
     """The other ends within 10 s, with one line; the resumed run has the bytes of a whole one."""
 
     def train(run: Path, *more: str) -> list[str]:
@@ -224,7 +220,7 @@ def test_a_killed_rank_ends_all_and_the_run_resumes(tiny_folder: Path, tmp_path:
     assert (run / MODEL_FILE).read_bytes() == (whole / MODEL_FILE).read_bytes()
 
 
-def test_ranks_save_by_the_clock_of_the_first(tiny_folder: Path, tmp_path: Path, small_default: None) -> None:
+def test_ranks_save_by_the_clock_of_the_first(tiny_folder: Path, tmp_path: Path) -> None:
     """Looking at the clock takes 20 s on it: the tenths that it saves are every second one. The other's is faster."""
 
     def work(rank: int) -> int:

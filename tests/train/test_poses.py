@@ -14,14 +14,13 @@ from nexwarp.io.pictures import to_uint8
 from nexwarp.model.poses import PoseCorrections, pose_differences, rigid_motion
 from nexwarp.run.evaluate import evaluate
 from nexwarp.run.fit_poses import fit_poses
-from nexwarp.train import recipe
 from nexwarp.train.initial import initial_poses
 from nexwarp.train.optimizer import rate_ends
 from nexwarp.train.recipe import DEMO_SETTINGS, DensifyConfig, LearningRates, preset, with_settings
 from nexwarp.train.target import with_cameras
 from nexwarp.train.trainer import Trainer
 from tests import scenes
-from tests.cli.support import FLAGS, SMALL
+from tests.cli.support import FLAGS
 from tests.tolerances import assert_close
 from tests.trainer_support import assert_resumed_alike, small, trained
 
@@ -170,8 +169,8 @@ def test_fitted_test_poses_come_back_and_the_model_stays(shown, model):
     assert all(parameter.requires_grad for parameter in model.parameters())
 
 
-def test_the_command_line_refines_and_says_so(tiny_folder, tmp_path, monkeypatch):
-    monkeypatch.setitem(recipe.PRESETS, "default", SMALL)
+@pytest.mark.usefixtures("small_preset")
+def test_the_command_line_refines_and_says_so(tiny_folder, tmp_path):
     run = tmp_path / "run"
     assert cli.main(["train", str(tiny_folder), "--run", str(run), *FLAGS, "--refine-poses"]) == 0
     cameras = json.loads((run / "cameras.json").read_text())

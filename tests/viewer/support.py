@@ -15,19 +15,15 @@ from PIL import Image
 
 import nexwarp as nw
 from nexwarp.viewer import Viewer, ViewerOptions
-from tests.scenes import intrinsics, rigid
+from tests.export.web import support
 
 OPTIONS = nw.RenderOptions(background=(0.1, 0.2, 0.3))
 WATCHED = ViewerOptions(0.01, port=0, total=10)  # of a training
 
 
-def ring(count: int = 6) -> dict[str, dict[str, nw.Camera]]:
+def ring() -> dict[str, dict[str, nw.Camera]]:
     """Cameras around the random scene, turned and off the origin."""
-    cameras = {}
-    for i in range(count):
-        viewmat = rigid((0.9, 0.2, -0.3 + 0.1 * i, 0.1), (0.3 - 0.2 * i, -0.2, 0.5)).float()
-        cameras[f"{i}.png"] = nw.Camera(viewmat, intrinsics(50.0, 50.0, 32.0, 24.0).float(), 64, 48)
-    return {"train": cameras}
+    return {"train": support.ring(6)}
 
 
 class Client:
