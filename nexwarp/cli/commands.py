@@ -53,20 +53,17 @@ if TYPE_CHECKING:
 class Process:
     """Make a scene of a video or of photos: choose sharp frames, then estimate the cameras by structure from motion.
 
-    Blurred and repeated frames of a video are left out; among photos, they are named. `process` and `sfm` are two names
-    of one command.
+    Blurred and repeated frames of a video are left out. `process` and `sfm` are two names of one command.
     """
 
     source: Annotated[Path, tyro.conf.Positional, option("VIDEO|PHOTOS")]
     """A video (extra `video`), or a folder of photos (JPEG, PNG, TIFF, BMP, WebP, AVIF, HEIC) with its subfolders; also
     of 360 degrees."""
     scene: Annotated[Path, tyro.conf.Positional, option("SCENE")]
-    """Output folder: images/ (undistorted), sparse/0/ (a COLMAP model) and the report sfm.json."""
+    """New folder: images/ (undistorted), sparse/0/ (a COLMAP model) and the report sfm.json."""
     frames: Annotated[int, option("N")] = FRAMES
     """Number of equal parts of a video, of which each gives its sharpest frame."""
     settings: tyro.conf.OmitArgPrefixes[SfmOptions] = dataclasses.field(default_factory=SfmOptions)
-    overwrite: Flag_ = False
-    """Replace images/, sparse/ and sfm.json of SCENE if nexwarp wrote all that is in them; other files stay."""
 
     def __call__(self, console: Console) -> None:
         """Make the scene."""
@@ -78,9 +75,7 @@ class Process:
     def make(self, console: Console) -> None:
         """Make the scene, and print the report."""
         with display.stages(console) as observe:
-            report = process(
-                self.source, self.scene, self.frames, self.settings, overwrite=self.overwrite, observe=observe
-            )
+            report = process(self.source, self.scene, self.frames, self.settings, observe=observe)
         console.print(display.results_table(report.rows(), str(self.scene)))
         for line in report.lines():
             console.print(line, soft_wrap=True, markup=False, highlight=False)

@@ -34,16 +34,12 @@ def smooth(directions: np.ndarray) -> np.ndarray:
     return (127.5 + 100 * np.sin(unit * [2.0, 3.0, 4.0] + unit[..., [1, 2, 0]])).round().astype(np.uint8)
 
 
-def make_walls() -> np.ndarray:
+@pytest.fixture(scope="module")
+def walls() -> np.ndarray:
     """(6, n, n) brightness of a room's walls: -x, x, -y, y, -z and z, along the next two axes."""
     noise = np.random.default_rng(3).random((6, TEXELS, TEXELS))
     fine = np.stack([gaussian_filter(wall, 3.0) + 2 * gaussian_filter(wall, 8.0) for wall in noise])
     return np.clip(127 + 500 * (fine - fine.mean()), 0, 255)
-
-
-@pytest.fixture(scope="module")
-def walls() -> np.ndarray:
-    return make_walls()
 
 
 def room(walls: np.ndarray, position: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from scipy.ndimage import gaussian_filter, shift
 
 from nexwarp.cli import main as cli
 from nexwarp.data import load_scene
 from nexwarp.data.sfm.frames import motion, sharpness, take_frames
-from nexwarp.data.sfm.photos import judged, read_photos
 from nexwarp.data.sfm.process import process
 from nexwarp.io.video import frame_luma, frame_pixels, video_writer
 from tests.cli.support import refused
@@ -104,15 +102,6 @@ def test_blurred_and_repeated_frames_are_left_out_and_named(tmp_path: Path) -> N
     still = clip(tmp_path / "b.mp4", 12, lambda i, x: picture if i < 6 else x, step=4)
     choice = take_frames(still, 12, tmp_path, silent)
     assert choice.duplicates == [1, 2, 3, 4, 5] and choice.chosen == [0, *range(6, 12)]
-
-
-def test_photos_that_are_blurred_or_repeated_are_named_and_kept(tmp_path: Path) -> None:
-    picture, names = texture(), [f"{i}.png" for i in range(6)]
-    for index, name in enumerate(names):
-        window = picture[20:140, 10 * min(index, 4) : 10 * min(index, 4) + 160]
-        window = gaussian_filter(window, 5.0) if index == 2 else window
-        Image.fromarray(window.astype(np.uint8)).convert("RGB").save(tmp_path / name)
-    assert judged(read_photos(tmp_path, names, 1, lambda done: None)[0]) == (["2.png"], ["5.png"])
 
 
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])

@@ -8,12 +8,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path, PurePosixPath
-from statistics import median
 from typing import TypeVar
-
-import numpy as np
 
 from nexwarp.data.capture import safe_name, short
 from nexwarp.data.images import (
@@ -28,7 +24,6 @@ from nexwarp.data.images import (
 )
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.scene import GIB, SHARE
-from nexwarp.data.sfm.frames import BLURRED, STILL, THUMBNAIL, motion, photo_luma, reduced_luma, sharpness
 from nexwarp.data.sfm.report import SfmOptions
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.machine import available_memory
@@ -55,8 +50,6 @@ class InputPhoto:
     size: tuple[int, int]  # width and height in pixels, upright
     device: tuple[str, str]  # make and model of the camera from EXIF, empty if absent
     focal: float | None  # in pixels from EXIF; None if absent
-    sharpness: float  # as of `frames.sharpness`
-    thumbnail: np.ndarray  # (h, w) uint8 brightness, reduced to 160 pixels
 
 
 def list_photos(folder: Path) -> tuple[list[str], dict[str, str]]:
@@ -196,7 +189,6 @@ def _read_photo(folder: Path, name: str, prepared: Path | None) -> InputPhoto:
         if prepared is not None:
             link(path, prepared / name)
     height, width = pixels.shape[:2]
-    luma = photo_luma(pixels)
     del pixels  # before pycolmap reads it
     try:
         camera = pycolmap_module().infer_camera_from_image(str(path))
@@ -205,8 +197,7 @@ def _read_photo(folder: Path, name: str, prepared: Path | None) -> InputPhoto:
     if (camera.width, camera.height) != (width, height):
         raise ValueError(f"{path}: expected {width}x{height}, pycolmap reads {camera.width}x{camera.height}")
     focal = camera.focal_length if camera.has_prior_focal_length else None
-    score, thumbnail = sharpness(reduced_luma(luma)), reduced_luma(luma, THUMBNAIL)
-    return InputPhoto(name, (width, height), _device(path), focal, score, thumbnail)
+    return InputPhoto(name, (width, height), _device(path), focal)
 
 
 def link(file: Path, target: Path) -> None:
@@ -216,17 +207,6 @@ def link(file: Path, target: Path) -> None:
         target.symlink_to(file.absolute())
     except OSError:  # Windows allows it to administrators only
         shutil.copyfile(file, target)
-
-
-def judged(photos: Sequence[InputPhoto]) -> tuple[list[str], list[str]]:
-    """Return the names of photos that are blurred, and of those that repeat the photo before."""
-    limit = BLURRED * median(photo.sharpness for photo in photos)
-    repeated = [
-        photo.name
-        for before, photo in pairwise(photos)
-        if before.thumbnail.shape == photo.thumbnail.shape and motion(photo.thumbnail, before.thumbnail) < STILL
-    ]
-    return [photo.name for photo in photos if photo.sharpness < limit], repeated
 
 
 def _device(path: Path) -> tuple[str, str]:

@@ -21,7 +21,6 @@ EXHAUSTIVE_UP_TO = 150  # photos: 11,175 pairs, a quarter of an hour on two core
 FEW_FEATURES = 500  # a photo
 GOOD_SHARE = 0.9  # share of registered photos below which the report gives advice
 LISTED = 8  # entries of a list in the report
-MANY = 100  # matches against the cameras that are shown; wheels of a train have 15 to 60
 
 
 @dataclass(frozen=True)
@@ -92,21 +91,6 @@ class EstimatedCamera:
 
 
 @dataclass(frozen=True)
-class Link:
-    """Two parts of a capture that verified matches link, though the scene does not have them so."""
-
-    photos: list[str]  # names of one part
-    others: list[str]  # names of the other
-    pairs: int  # number of pairs between them with such matches
-    matches: int  # their number
-
-    def text(self) -> str:
-        """The two parts and their link, in words."""
-        ends = [f"{len(part)} photos ({short(part[0])} to {short(part[-1])})" for part in (self.photos, self.others)]
-        return f"{ends[0]} and {ends[1]}, {self.matches:,} matches in {self.pairs:,} pairs"
-
-
-@dataclass(frozen=True)
 class SfmReport:
     """The result of a reconstruction."""
 
@@ -124,13 +108,9 @@ class SfmReport:
     matching: str  # "exhaustive" or "sequential"
     seconds: dict[str, float]  # wall-clock time of each stage
     advice: list[str]  # how to get more photos registered; empty if 90 % or more are registered
-    blurred: list[str]  # names of photos that are much less sharp than the others; they are used all the same
-    repeated: list[str]  # names of photos that show nearly the same as the one before; they are used all the same
     frames: FrameChoice | None = None  # the frames of a video; None for photos
     mapper: str = "incremental"  # or "global"
     skipped: dict[str, str] = field(default_factory=dict)  # name -> reason, for each photo that was not read
-    separate: list[Link] = field(default_factory=list)  # the scene's photos and those of each other model
-    contradictions: list[Link] = field(default_factory=list)  # photos of the scene, matches against their cameras
     panoramas: int = 0  # number of panoramas, each cut into six of the photos
 
     def rows(self) -> dict[str, str]:
@@ -158,22 +138,16 @@ class SfmReport:
         return rows
 
     def lines(self) -> list[str]:
-        """What is suspicious, the photos that were left out, and the advice, one line each."""
+        """The photos that were not read or left out, and the advice, one line each."""
         lines = []
         for reason in list(dict.fromkeys(self.skipped.values())):
             names = [short(name) for name in self.skipped if self.skipped[name] == reason]
             more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
             lines.append(f"skipped {len(names)}: {', '.join(names[:LISTED])}{more}: {reason}")
-        lines += [f"blurred: {name}; kept" for name in self.blurred]
-        lines += [f"repeats the photo before: {name}; kept" for name in self.repeated]
         names = list(self.left_out)
         lines += [f"left out: {name}: {self.left_out[name]}" for name in names[:LISTED]]
         if len(names) > LISTED:
             lines.append(f"left out: {len(names) - LISTED} more, all named in sfm.json")
-        lines += [f"not joined: {link.text()}" for link in self.separate[:LISTED]]
-        alike = "contradict the cameras: two things look alike, or one moved"
-        shown = [link for link in self.contradictions if link.matches >= MANY]
-        lines += [f"parts disagree: {link.text()} {alike}" for link in shown[:LISTED]]
         return lines + [f"advice: {text}" for text in self.advice]
 
 

@@ -16,14 +16,12 @@ from nexwarp.data.colmap import read_model
 from nexwarp.data.images import read_image
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.sfm.panoramas import cut_panoramas, find_panoramas, rig, view_groups
-from nexwarp.data.sfm.parts import contradictions, grouped, separate
 from nexwarp.data.sfm.photos import (
     InputPhoto,
     affordable_threads,
     camera_groups,
     camera_model,
     is_copied,
-    judged,
     read_each,
     read_photos,
 )
@@ -98,18 +96,14 @@ class Stages:
         with self._stage("mapping", len(names)) as done:
             models, mapper = self._map(overlaps, done)
         registered = _names(models[0])
-        parts = [_names(model) for model in models]
-        with open_database(self.database) as database:
-            disagreeing = contradictions(database, models[0])
         with self._stage("undistorting", len(registered)) as done:
             sizes = self._undistort(models[0], done)
         with self._stage("checking", len(registered)) as done:
             self._check(done)
-        blurred, repeated = judged(plain) if plain else ([], [])
         return SfmReport(
             photos=given,
             registered=[name for name in names if name in set(registered)],
-            left_out=left_out(overlaps, registered, parts),
+            left_out=left_out(overlaps, registered, [_names(model) for model in models]),
             points=models[0].num_points3D(),
             mean_track_length=models[0].compute_mean_track_length(),
             mean_reprojection_error=models[0].compute_mean_reprojection_error(),
@@ -122,11 +116,7 @@ class Stages:
             mapper=mapper,
             seconds={stage: round(value, 2) for stage, value in self.seconds.items()},
             advice=advise(overlaps, len(registered)),
-            blurred=blurred,
-            repeated=repeated,
             skipped=skipped,
-            separate=separate(overlaps, parts),
-            contradictions=grouped(disagreeing),
             panoramas=len(set(self.views.values())),
         )
 
