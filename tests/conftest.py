@@ -110,3 +110,9 @@ def tiny_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny_scene(tiny_folder: Path) -> Scene:
     """The same, read."""
     return nw.load_scene(tiny_folder)
+
+
+@pytest.fixture(scope="session")
+def scene(tiny_scene: Scene) -> Scene:
+    """The scene of most trainings."""
+    return tiny_scene

@@ -61,10 +61,6 @@ def test_other_arrays_and_unknown_depths(tmp_path: Path) -> None:
     assert read_depth(tmp_path / "c.npy").tolist() == [[0, 0, 0], [0, 65504, 3]]
 
 
-def _truncate(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
 BAD: dict[str, tuple[str, Any, str]] = {
     "colour": ("a.png", lambda p: Image.new("RGB", (4, 3)).save(p), "expected one channel of 8 or 16 bits, got"),
     "three channels": ("a.exr", lambda p: save_exr(p, {"image": torch.ones(3, 4, 3)}), "expected one channel, got 3"),
@@ -82,7 +78,7 @@ def test_other_files_are_refused_in_one_line(tmp_path: Path, case: str) -> None:
     name, write, message = BAD.get(case, (case.removeprefix("cut "), None, "expected"))
     if write is None:
         WRITERS[name](tmp_path / name, VALUES)
-        _truncate(tmp_path / name)
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[: (tmp_path / name).stat().st_size // 2])
     else:
         write(tmp_path / name)
     with pytest.raises(ValueError, match=message) as caught:

@@ -12,11 +12,6 @@ from tests.reference.collect import rotations
 from tests.trainer_support import rescaled, small
 
 
-@pytest.fixture(scope="session")
-def scene(tiny_scene: Scene) -> Scene:
-    return tiny_scene
-
-
 def centre_of(scene: Scene) -> torch.Tensor:
     return torch.stack([view.camera.position for view in scene.train]).mean(0)
 

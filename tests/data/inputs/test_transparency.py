@@ -36,17 +36,6 @@ def test_transparent_photos_lie_on_the_background(transparent, given, color):
         assert np.array_equal(view.alpha.numpy(), rgba[..., 3]) and view.mask is None
 
 
-def test_another_background_follows_from_alpha(transparent):
-    """The formula that View.alpha's description gives, which random backgrounds in training rest on."""
-    path, _ = transparent
-    white, blue = load_scene(path), load_scene(path, background=(0.0, 0.0, 1.0))
-    for one, other in zip(white.train, blue.train, strict=True):
-        shift = torch.tensor(blue.background) - torch.tensor(white.background)
-        assert one.alpha is not None
-        moved = one.image / 255 + (1 - one.alpha[:, :, None] / 255) * shift
-        assert (255 * moved - other.image).abs().max() <= 1.0 + 1e-3
-
-
 def test_random_backgrounds_are_for_training_alone(transparent):
     path, _ = transparent
     white, random = load_scene(path), load_scene(path, background="random")
