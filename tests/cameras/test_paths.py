@@ -7,19 +7,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from nexwarp.cameras import paths
 from nexwarp.cameras.camera import Camera, reduced, resized
-from nexwarp.cameras.paths import (
-    between,
-    camera_poses,
-    ellipse,
-    focus,
-    interpolate,
-    look_at,
-    subject,
-    suited_path,
-    through,
-    up_direction,
-)
+from nexwarp.cameras.paths import ellipse, focus, interpolate, look_at, through, up_direction
 from tests.narrowing import present
 from tests.tolerances import assert_close
 
@@ -185,14 +175,14 @@ def test_a_walk_by_hand_becomes_a_steady_path() -> None:
 
     cameras = walk()
     path = interpolate(cameras, 60)
-    up, (viewmats, places), given = up_direction(cameras), camera_poses(path), positions(cameras)
+    up, (viewmats, places), given = up_direction(cameras), paths.camera_poses(path), positions(cameras)
     assert up @ UP > math.cos(math.radians(3.0))
     assert (viewmats[:, 0, :3] @ up).abs().max() < 1e-12 and (viewmats[:, 1, :3] @ up).max() < 0.0, "no roll"
     hull = torch.from_numpy(ConvexHull(given).equations)
     assert (places @ hull[:, :3].T + hull[:, 3]).max() < 0.01, "within the hull of the cameras"
     unsteady, steady = (x.diff(n=2, dim=0).norm(dim=1).mean() for x in (given, places))
     assert steady < 0.2 * unsteady
-    aims, own = (m[:, 2, :3].diff(n=2, dim=0).norm(dim=1).mean() for m in (viewmats, camera_poses(cameras)[0]))
+    aims, own = (m[:, 2, :3].diff(n=2, dim=0).norm(dim=1).mean() for m in (viewmats, paths.camera_poses(cameras)[0]))
     assert aims < 0.2 * own
     assert (places[:, :2].norm(dim=1) > 2.7).all(), "as far away as the photos were"
     seen = viewmats[:, :3, 3] @ INTRINSICS.T  # the origin, which the cameras look at
@@ -201,22 +191,22 @@ def test_a_walk_by_hand_becomes_a_steady_path() -> None:
 
 
 def test_an_ellipse_suits_cameras_around_a_subject_that_they_look_at() -> None:
-    assert suited_path(walk()) == suited_path(ring(count=60)) == "ellipse"
+    assert paths.suited_path(walk()) == paths.suited_path(ring(count=60)) == "ellipse"
     outwards = [camera(place, 2 * place) for place in positions(walk())]
     aside = [camera(place, place + torch.linalg.cross(place, UP)) for place in positions(walk())]
     for others in (walk(arc=math.pi), row(), outwards, aside, [ONE], []):
-        assert suited_path(others) == "interpolate"
+        assert paths.suited_path(others) == "interpolate"
 
 
 def test_a_subject_is_what_cameras_all_around_have_in_their_middle() -> None:
     cameras = ring(count=60)
-    centre, radius = present(subject(cameras))
+    centre, radius = present(paths.subject(cameras))
     assert_close(centre, focus(cameras), kind="value", name="centre")
     depths = [(each.viewmat[:3, :3] @ centre + each.viewmat[:3, 3])[2].item() for each in cameras]
     assert radius == pytest.approx(float(np.median(depths)) * 64 / 90 / 2)
     beside = [each.crop(22, 0, 42, 48) for each in cameras]
-    assert suited_path(beside) == "ellipse" and subject(beside) is None
-    assert all(subject(others) is None for others in (walk(arc=math.pi), row(), [ONE], []))
+    assert paths.suited_path(beside) == "ellipse" and paths.subject(beside) is None
+    assert all(paths.subject(others) is None for others in (walk(arc=math.pi), row(), [ONE], []))
 
 
 ONE = camera(torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]))
@@ -276,7 +266,7 @@ def test_cameras_between_lie_on_the_way_to_a_neighbour_that_looks_alike() -> Non
     cameras.append(camera(row[0] - 0.1 * UP, row[0] - ahead))
     seen = set()
     for seed in range(40):
-        made = between(cameras, torch.Generator().manual_seed(seed))
+        made = paths.between(cameras, torch.Generator().manual_seed(seed))
         assert_close(made[3].viewmat, cameras[3].viewmat, kind="value", name="viewmat")
         for one, new in zip(cameras[:3], made[:3], strict=True):
             x = (new.position - one.position)[0].item()

@@ -195,16 +195,3 @@ def test_an_export_learns_from_training_photos_alone(finished, tmp_path):
     assert without != files and not lines
     with pytest.warns(UserWarning, match="the photos cannot be read .* nothing is fitted to them"):
         assert baked_files(finished, path=str(tmp_path / "gone")) == (without, [])
-
-
-@pytest.mark.cuda
-@pytest.mark.parametrize("kind", ["web", "glb"])
-def test_a_gpu_tells_what_the_cpu_tells(finished, tmp_path, kind):
-    told = {}
-    for device in ("cpu", "cuda"):
-        lines: list[str] = []
-        export_run(
-            open_model(finished), ExportOrder(kind, tmp_path / device, alpha="blend"), device, report=lines.append
-        )
-        told[device] = [float(x) for x in re.findall(r"([\d.]+) dB", lines[-1])]
-    assert told["cuda"] == pytest.approx(told["cpu"], abs=0.3)

@@ -9,17 +9,9 @@ import torch
 import nexwarp as nw
 from nexwarp.cameras.paths import look_at
 from nexwarp.errors import FormatError, RunError, SettingError
+from nexwarp.export import splats as splat_files
 from nexwarp.export.mesh import Mesh, _surface, _without_crumbs, extract_mesh, save_mesh
-from nexwarp.export.splats import (
-    SPLATTING,
-    THINNESS,
-    Pieces,
-    gaussians,
-    save_splats_glb,
-    save_splats_ply,
-    save_surfels_ply,
-    split_large,
-)
+from nexwarp.export.splats import Pieces, gaussians, save_splats_ply, save_surfels_ply, split_large
 from nexwarp.io.pictures import to_uint8
 from nexwarp.ops.tsdf import DistanceField
 from nexwarp.run.evaluate import psnr
@@ -86,7 +78,7 @@ def test_splats_are_flat_gaussians(tmp_path: Path, given: int, kept: int) -> Non
     assert all(x.dtype == torch.float32 and x.isfinite().all() for x in columns.values())
     scales = stack(columns, *numbered("scale", 3)).exp()
     assert_close(scales[:, :2], scene["scales"], kind="value", name="scale")
-    assert_close(scales[:, 2], THINNESS * scene["scales"].amin(1), kind="value", name="scale_2")
+    assert_close(scales[:, 2], splat_files.THINNESS * scene["scales"].amin(1), kind="value", name="scale_2")
     quats = stack(columns, *numbered("rot", 4))
     assert (quats.norm(dim=1) - 1).abs().max() < 1e-6
     assert_close(rotations(quats), rotations(scene["quats"]), kind="value", name="rotation")
@@ -102,7 +94,7 @@ def test_gltf_holds_the_gaussians_of_the_ply(tmp_path: Path, degree: int) -> Non
     """By the ratified KHR_gaussian_splatting: linear scales, opacities in [0, 1], quaternions xyzw."""
     splats = gaussians(make_surfels(random_scene(sh_degree=3)), degree, [CAMERA])
     save_splats_ply(tmp_path / "a.ply", splats)
-    save_splats_glb(tmp_path / "a.glb", splats, [CAMERA])
+    splat_files.save_splats_glb(tmp_path / "a.glb", splats, [CAMERA])
     columns, content = read(tmp_path / "a.ply"), (tmp_path / "a.glb").read_bytes()
     assert struct.unpack_from("<4sII", content) == (b"glTF", 2, len(content))
     length, kind = struct.unpack_from("<I4s", content, 12)
@@ -112,7 +104,7 @@ def test_gltf_holds_the_gaussians_of_the_ply(tmp_path: Path, degree: int) -> Non
     assert tree["buffers"] == [{"byteLength": len(content) - start - 8}]
     primitive = tree["meshes"][0]["primitives"][0]
     assert primitive["mode"] == 0 and tree["extensionsUsed"] == list(primitive["extensions"])
-    assert primitive["extensions"][SPLATTING] == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    assert primitive["extensions"][splat_files.SPLATTING] == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     sizes, found = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}, {}
     for name, number in primitive["attributes"].items():
         accessor = tree["accessors"][number]
@@ -120,7 +112,7 @@ def test_gltf_holds_the_gaussians_of_the_ply(tmp_path: Path, degree: int) -> Non
         assert accessor["componentType"] == 5126 and view["byteOffset"] % 4 == 0
         offset, count = start + 8 + view["byteOffset"], view["byteLength"] // 4
         values = torch.frombuffer(bytearray(content), dtype=torch.float32, offset=offset, count=count)
-        found[name.removeprefix(f"{SPLATTING}:")] = values.view(accessor["count"], sizes[accessor["type"]])
+        found[name.removeprefix(f"{splat_files.SPLATTING}:")] = values.view(accessor["count"], sizes[accessor["type"]])
     assert found["POSITION"].equal(stack(columns, "x", "y", "z"))
     corners = tree["accessors"][primitive["attributes"]["POSITION"]]
     assert corners["min"] == found["POSITION"].amin(0).tolist() and corners["max"] == found["POSITION"].amax(0).tolist()
@@ -135,7 +127,7 @@ def test_gltf_holds_the_gaussians_of_the_ply(tmp_path: Path, degree: int) -> Non
     linear = (found["COLOR_0"][:, :3] - (0.5 + 0.28209479177387814 * found[names[0]]).clamp(0, 1).pow(2.2)).abs()
     assert linear.max() < 0.01 and found["COLOR_0"][:, 3:].equal(found["OPACITY"])
     with pytest.raises(FormatError, match="expected surfels"):
-        save_splats_glb(tmp_path / "none.glb", gaussians(make_surfels(random_scene(0))), [CAMERA])
+        splat_files.save_splats_glb(tmp_path / "none.glb", gaussians(make_surfels(random_scene(0))), [CAMERA])
 
 
 # Large surfels become several Gaussians

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from nexwarp.io.pictures import THREADS, error_map, png_files, save_png, side_by_side, to_uint8, viridis
+from nexwarp.io.pictures import THREADS, error_map, png_files, save_png, to_uint8, viridis
 from tests.cli.support import picture
 
 
@@ -49,13 +49,3 @@ def test_error_map_runs_from_violet_to_yellow_at_a_quarter() -> None:
     assert (light.diff() > 0).all(), "a larger error must be lighter"
     red, grey = torch.tensor([[[0.6, 0.0, 0.0]]]), torch.full((1, 1, 3), 0.2)
     assert error_map(red, torch.zeros(1, 1, 3)).equal(error_map(torch.zeros(1, 1, 3), grey)), "the mean of channels"
-
-
-def test_strip_holds_the_images_and_white_gaps() -> None:
-    a, b = torch.randint(255, (5, 4, 3), dtype=torch.uint8), torch.rand(5, 7, 3)
-    strip = side_by_side([a, b], gap=3)
-    assert strip.shape == (5, 14, 3) and strip[:, :4].equal(a) and strip[:, 7:].equal(to_uint8(b))
-    assert strip[:, 4:7].eq(255).all()
-    captioned = side_by_side([a, b], captions=["truth", ""])
-    assert captioned.shape == (21, 15, 3) and captioned[16:].equal(side_by_side([a, b]))
-    assert (captioned[:16, :4] < 128).any() and captioned[:16, 4:].eq(255).all()

@@ -12,19 +12,8 @@ import nexwarp as nw
 from examples import read_model
 from nexwarp.cli import main as cli
 from nexwarp.io.pictures import to_uint8
-from nexwarp.model.compact import (
-    CODE,
-    CODED,
-    FREE,
-    NOISE,
-    PER_BYTE,
-    REACH,
-    STEPS,
-    decode,
-    encode,
-    surface_points,
-    texture_sensitivity,
-)
+from nexwarp.model import compact
+from nexwarp.model.compact import CODE, FREE, NOISE, REACH, STEPS, decode, encode
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import COMPACT_VERSION, MODEL_FILE, save_model
 from nexwarp.model.texture import NEVER, DetailLimits
@@ -49,7 +38,7 @@ def full_tensors(model: Model, folder: Path) -> dict[str, torch.Tensor]:
 
 def coded_and_decoded(tensors: dict[str, torch.Tensor]) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
     coded = encode(tensors)
-    return coded, decode(coded, {name: list(tensors[name].shape) for name in coded.keys() & set(CODED)})
+    return coded, decode(coded, {name: list(tensors[name].shape) for name in coded.keys() & set(compact.CODED)})
 
 
 def test_a_compact_model_looks_the_same(tmp_path: Path) -> None:
@@ -96,7 +85,7 @@ def test_the_grid_gets_the_noise_that_is_asked_for(features: int, residual: bool
     texture.resolutions.copy_(torch.tensor([4.0, 9.0, 20.0]))
     mixed = torch.randn(3, 2**10, features) @ torch.randn(features, features) + 2.0
     texture.grid.data = mixed * torch.tensor([0.1, 1.0, 3.0])[:, None, None]
-    sensitivity = texture_sensitivity(nw.Model(make_surfels(random_scene(60)), texture))
+    sensitivity = compact.texture_sensitivity(nw.Model(make_surfels(random_scene(60)), texture))
     points, directions = torch.rand(4000, 3) * 2 - 1, torch.nn.functional.normalize(torch.randn(4000, 3))
 
     def colors(grid: torch.Tensor) -> torch.Tensor:
@@ -116,7 +105,7 @@ def test_the_grid_gets_the_noise_that_is_asked_for(features: int, residual: bool
 def test_features_that_say_the_same_are_coded_once() -> None:
     torch.manual_seed(0)
     texture = nw.NeuralTexture(levels=1, table_size=2**12, features=4)
-    sensitivity = texture_sensitivity(nw.Model(make_surfels(random_scene(60)), texture))
+    sensitivity = compact.texture_sensitivity(nw.Model(make_surfels(random_scene(60)), texture))
     unlike = torch.randn(1, 2**12, 4)
     alike = unlike[..., :1].expand(-1, -1, 4)
     sizes = [len(encode({"texture.grid": grid}, sensitivity)["texture.grid"]) for grid in (alike, unlike)]
@@ -126,7 +115,7 @@ def test_features_that_say_the_same_are_coded_once() -> None:
 def test_points_lie_on_the_surfels() -> None:
     surfels = make_surfels(random_scene(5))
     surfels.logit_opacities.data[2] = -9000.0
-    ids, points = surface_points(surfels, torch.Generator().manual_seed(0))
+    ids, points = compact.surface_points(surfels, torch.Generator().manual_seed(0))
     offsets, normals = points - surfels.means.detach()[ids], surfels.normals.detach()[ids]
     assert float((offsets * normals).sum(1).abs().max()) < 1e-4
     for i, scales in enumerate(surfels.scales.detach()):
@@ -140,7 +129,7 @@ def test_numbers_that_are_alike_do_not_make_a_file_that_is_refused(monkeypatch: 
     monkeypatch.setattr("nexwarp.model.compact.FREE", 100)
     zeros = {"texture.grid": torch.zeros(2, 2**16, 4)}
     coded, after = coded_and_decoded(zeros)
-    assert len(coded["texture.grid"]) == pytest.approx(2**19 / PER_BYTE, rel=0.1)
+    assert len(coded["texture.grid"]) == pytest.approx(2**19 / compact.PER_BYTE, rel=0.1)
     assert torch.equal(after["texture.grid"], zeros["texture.grid"])
     with pytest.raises(ValueError, match=r"texture.grid: expected at most"):
         decode(coded, {"texture.grid": [2, 2**17, 4]})
@@ -148,15 +137,15 @@ def test_numbers_that_are_alike_do_not_make_a_file_that_is_refused(monkeypatch: 
 
 def test_files_of_version_2_still_load(tmp_path: Path) -> None:
     run = Path(__file__).parents[1] / "old_files" / "0.2.0-69de7c9"
-    full, compact = nw.load(run), nw.load(run / "compact.safetensors")
-    assert compact.meta["format_version"] == 2
+    full, coded = nw.load(run), nw.load(run / "compact.safetensors")
+    assert coded.meta["format_version"] == 2
     expected = full.state_dict()
-    for name, value in compact.state_dict().items():
+    for name, value in coded.state_dict().items():
         if name == "surfels.raw_quats":
-            value, expected[name] = compact.surfels.quats.detach(), full.surfels.quats.detach()
+            value, expected[name] = coded.surfels.quats.detach(), full.surfels.quats.detach()
         assert float((value - expected[name]).abs().max()) <= 0.01 * float(expected[name].abs().max()), name
-    assert compact.options == full.options
-    assert nw.load(compact.save(tmp_path, compact=True)).meta["format_version"] == COMPACT_VERSION
+    assert coded.options == full.options
+    assert nw.load(coded.save(tmp_path, compact=True)).meta["format_version"] == COMPACT_VERSION
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

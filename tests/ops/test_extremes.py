@@ -7,19 +7,11 @@ import nexwarp as nw
 from nexwarp import ops
 from nexwarp.kernels.tiles import LARGEST_INT, MAX_ENTRIES
 from nexwarp.native.warp import tile_size_on
+from tests import scenes
 from tests.narrowing import present
 from tests.ops.test_laws import awkward_scene
 from tests.render_support import BACKGROUND, BUFFERS
-from tests.scenes import (
-    SURFEL_KEYS,
-    Scene,
-    detached_shape,
-    facing_scene,
-    make_camera,
-    make_surfels,
-    make_texture,
-    random_scene,
-)
+from tests.scenes import SURFEL_KEYS, Scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close, assert_finite
 
 SIDE = 8192
@@ -38,7 +30,7 @@ def scene_with(device: torch.device, count: int = 24, **values: Any) -> Scene:
 
 def facing(device: torch.device, **values: Any) -> Scene:
     """One surfel four units before the camera, its axes along the image's; 16 x 16 pixels, a unit is 8 of them."""
-    scene = facing_scene((4.0, 0.9), scale=0.5, size=(16, 16), focal=32.0, device=device)
+    scene = scenes.facing_scene((4.0, 0.9), scale=0.5, size=(16, 16), focal=32.0, device=device)
     for name, value in values.items():
         scene[name] = torch.as_tensor(value, device=device).expand_as(scene[name]).clone()
     return scene
@@ -210,7 +202,7 @@ def test_more_entries_than_int32_counts_never_overrun(count: int, device: torch.
     """On CUDA a list is made before anybody knows how many there are."""
     surfels, camera = too_many(device, count)
     pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
-    shape = detached_shape(surfels)
+    shape = scenes.detached_shape(surfels)
     projection = ops.project(*shape, torch.zeros_like(shape[0]), camera.viewmat)
     tiles = ops.intersect_tiles(shape, projection, camera.viewmat, pinhole, room=1000)
     assert int(tiles.ends[-1]) == LARGEST_INT > len(tiles.surfel_ids) == 1000  # so the walk goes over all surfels

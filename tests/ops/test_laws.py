@@ -2,17 +2,9 @@ import pytest
 import torch
 
 import nexwarp as nw
+from tests import scenes
 from tests.render_support import BACKGROUND, BUFFERS, MAX_HITS, assert_alike, assert_same, draw, reference_render, twin
-from tests.scenes import (
-    SURFEL_KEYS,
-    Scene,
-    facing_scene,
-    layered_scene,
-    make_camera,
-    make_surfels,
-    make_texture,
-    random_scene,
-)
+from tests.scenes import SURFEL_KEYS, Scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close, assert_same_ids
 
 
@@ -99,7 +91,7 @@ def test_awkward_surfels_agree_with_the_reference(device: torch.device) -> None:
 
 @pytest.mark.parametrize("max_hits", [0, 1, 2, 3, 5, 8])
 def test_every_buffer_size(max_hits: int, device: torch.device) -> None:
-    scene = layered_scene(device=device)
+    scene = scenes.layered_scene(device=device)
     most, out = (draw(scene, max_hits=size) for size in (MAX_HITS, max_hits))
     assert_same_ids(out.ids, most.ids[..., :max_hits], name="ids")
     for name in ("weights", "depths"):
@@ -109,7 +101,7 @@ def test_every_buffer_size(max_hits: int, device: torch.device) -> None:
 def in_a_row(device: torch.device, opacities: list[float], scale: float = 100.0, depth: float = 1.0) -> Scene:
     """Surfels facing a camera of one pixel, one behind the other, one unit apart."""
     surfels = ((depth + index, opacity) for index, opacity in enumerate(opacities))
-    return facing_scene(*surfels, scale=scale, size=(1, 1), focal=10.0, device=device)
+    return scenes.facing_scene(*surfels, scale=scale, size=(1, 1), focal=10.0, device=device)
 
 
 def test_of_equal_weights_the_nearer_stays_when_a_heavier_one_comes(device: torch.device) -> None:

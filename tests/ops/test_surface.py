@@ -7,15 +7,7 @@ import nexwarp as nw
 from tests.reference.collect import Shape
 from tests.reference.surface import surface
 from tests.render_support import view_of
-from tests.scenes import (
-    Scene,
-    detached_shape,
-    facing_scene,
-    layered_scene,
-    make_camera,
-    make_surfels,
-    named_scene,
-)
+from tests.scenes import Scene, detached_shape, facing_scene, layered_scene, make_camera, make_surfels, named_scene
 from tests.tolerances import FLIPS, assert_close
 
 DEPTHS = ("expected_depth", "median_depth", "top_depth")

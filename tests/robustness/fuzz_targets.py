@@ -35,19 +35,10 @@ from nexwarp.model.model_file import load, save_model
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
 from nexwarp.run.photo_table import load_photo_table
 from nexwarp.train.recipe import Config, TextureConfig
+from tests import scene_writers
 from tests.model_file_support import make_model
 from tests.robustness.fuzz_inputs import Files
-from tests.scene_writers import (
-    BARREL,
-    FISHEYE,
-    demo_lens,
-    write_blender,
-    write_demo,
-    write_distorted,
-    write_nerfstudio,
-    write_points,
-    write_text,
-)
+from tests.scene_writers import BARREL, FISHEYE, demo_lens, write_demo, write_distorted, write_nerfstudio, write_points
 from tests.scenes import make_camera, make_surfels, random_scene
 
 WIDTH, HEIGHT, VIEWS = 12, 9, 3
@@ -95,7 +86,7 @@ def _colmap(text: bool) -> Callable[[Path], list[Files]]:
         for model, coefficients in (("OPENCV", BARREL), ("OPENCV_FISHEYE", FISHEYE)):
             scenes.append(write_distorted(scenes[0], folder / model, demo_lens(scenes[0], model, coefficients)))
         if text:
-            scenes = [write_text(scene, folder / f"{scene.name} text") for scene in scenes]
+            scenes = [scene_writers.write_text(scene, folder / f"{scene.name} text") for scene in scenes]
         return [_files(scene) for scene in scenes]
 
     return make
@@ -125,7 +116,7 @@ def _nerfstudio(folder: Path) -> list[Files]:
 
 
 def _blender(folder: Path) -> list[Files]:
-    return [_files(write_blender(_scene(folder / "colmap"), folder / "blender"))]
+    return [_files(scene_writers.write_blender(_scene(folder / "colmap"), folder / "blender"))]
 
 
 def _some_model(folder: Path) -> nw.Model:

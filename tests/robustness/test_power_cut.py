@@ -36,16 +36,7 @@ from nexwarp.io import files
 from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
 from nexwarp.run import folder
-from nexwarp.run.folder import (
-    LOG_FILE,
-    METRICS_FILE,
-    RunRecord,
-    claimed_run,
-    create_run,
-    read_metrics,
-    read_run,
-    remove_leftovers,
-)
+from nexwarp.run.folder import LOG_FILE, RunRecord, claimed_run, create_run, read_metrics, read_run, remove_leftovers
 from nexwarp.run.log import keep_lines
 from nexwarp.train import checkpoint
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
@@ -264,7 +255,7 @@ def live(root: Path, number: int, allow: Callable[..., None], chance: random.Ran
         save_model(run, model)
         allow({number}, {last}, {number})
         save_cameras(run / CAMERAS_FILE, {"train": {"a": make_camera(random_scene(4))}, "test": {}})
-        write_json(run / METRICS_FILE, {"psnr": 20.0})
+        write_json(run / folder.METRICS_FILE, {"psnr": 20.0})
 
 
 def check(root: Path, allowed: Allowed) -> None:

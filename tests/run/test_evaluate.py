@@ -1,6 +1,5 @@
 """Evaluation: its figures are those of the pictures that it writes."""
 
-import math
 import os
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import torch
 import nexwarp as nw
 from nexwarp.data import View
 from nexwarp.io.pictures import CAPTION_HEIGHT, error_map, to_uint8
-from nexwarp.run.evaluate import CONVENTION, evaluate, ssim
+from nexwarp.run.evaluate import CONVENTION, evaluate, psnr, ssim
 from tests.cli.support import picture
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 
@@ -39,10 +38,6 @@ def rendered(model: nw.Model, camera: nw.Camera) -> torch.Tensor:
     return to_uint8(model.render(camera).image)
 
 
-def psnr_of(a: torch.Tensor, b: torch.Tensor) -> float:
-    return -10 * math.log10((((a.double() - b.double()) / 255) ** 2).mean().item())
-
-
 def test_figures_are_those_of_the_written_pictures(tmp_path, model):
     views = views_of(model)
     done: list[str] = []
@@ -53,13 +48,15 @@ def test_figures_are_those_of_the_written_pictures(tmp_path, model):
         written = picture(tmp_path / "test" / Path(view.name).with_suffix(".png"))
         assert torch.equal(written, rendered(model, view.camera))
         figures = result["views"][view.name]
-        assert figures["psnr"] == pytest.approx(psnr_of(written, view.image), abs=1e-5)
+        assert figures["psnr"] == pytest.approx(psnr(written, view.image), abs=1e-9)
         assert figures["ssim"] == pytest.approx(ssim(written, view.image), abs=1e-9)
     each: list[Any] = [result["views"][name] for name in NAMES]
     first, second = each
     assert first["psnr"] > second["psnr"] + 5 and first["ssim"] > second["ssim"]
     for key in ("psnr", "ssim"):
         assert result[key] == pytest.approx((first[key] + second[key]) / 2, abs=1e-12)
+    with pytest.raises(ValueError, match=r"^views: expected at least one view"):
+        evaluate(model, [])
 
 
 def test_strips_show_photo_render_and_error(tmp_path, model):
@@ -76,8 +73,3 @@ def test_strips_show_photo_render_and_error(tmp_path, model):
     files = sorted(str(file.relative_to(tmp_path)) for file in tmp_path.rglob("*") if file.is_file())
     stems = ("a", os.path.join("deep", "er", "b.c"))
     assert files == sorted(os.path.join(folder, f"{stem}.png") for folder in ("test", "compare") for stem in stems)
-
-
-def test_no_views(model):
-    with pytest.raises(ValueError, match=r"^views: expected at least one view"):
-        evaluate(model, [])

@@ -21,19 +21,9 @@ from nexwarp.train.checkpoint import has_checkpoint
 from nexwarp.train.parallel import MOST_CAPTURED_BYTES, ParallelTrainer, scale_for_batch, sums_beside
 from nexwarp.train.ranks.ranks import WAIT_VARIABLE, Ranks, check_count
 from nexwarp.train.recipe import Config, DensifyConfig
+from tests import ranks_support
 from tests.cli.support import refused
-from tests.ranks_support import (
-    CPU,
-    alone_as,
-    digest,
-    environment,
-    free_port,
-    kept_gradients,
-    printed,
-    run_ranks,
-    start_ranks,
-    wait,
-)
+from tests.ranks_support import CPU, alone_as, digest, kept_gradients, printed, run_ranks, start_ranks, wait
 from tests.scenes import make_surfels, random_scene
 from tests.tolerances import assert_close
 from tests.trainer_support import OFTEN, TEXTURE, small
@@ -180,7 +170,7 @@ def test_ranks_that_do_not_fit_are_refused_alike(scene: nw.Scene, tmp_path: Path
 
 
 def test_a_missing_rank_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in (environment(0, 3, free_port()) | {WAIT_VARIABLE: "0.3"}).items():
+    for name, value in (ranks_support.environment(0, 3, ranks_support.free_port()) | {WAIT_VARIABLE: "0.3"}).items():
         monkeypatch.setenv(name, value)
     with pytest.raises(RankError, match=r"expected 3 ranks to join at 127\.0\.0\.1:\d+ within 0 s \("):
         Ranks.join(CPU)

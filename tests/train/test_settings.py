@@ -9,18 +9,8 @@ from PIL import Image
 from nexwarp.cli import main as cli
 from nexwarp.cli.train import Train
 from nexwarp.data.scene import SceneSource
-from nexwarp.train.recipe import (
-    PRESETS,
-    Config,
-    DensifyConfig,
-    LearningRates,
-    LossWeights,
-    config_from_dict,
-    parse_settings,
-    preset,
-    setting,
-    with_settings,
-)
+from nexwarp.train import recipe
+from nexwarp.train.recipe import PRESETS, Config, config_from_dict, parse_settings, preset, setting, with_settings
 from tests.cli.support import refused
 from tests.scene_writers import write_blender
 
@@ -88,9 +78,9 @@ def test_paper_is_the_paper():
     assert (p.max_surfels, p.background, p.more_hits_from, p.mask_mode) == (400_000, (0.0, 0.0, 0.0), 0, "ignore")
     assert not any((p.filter_points, p.orient_points, p.footprints, p.smooth_sh, p.exposures))
     zero = {"depth": 0.0, "depth_maps": 0.0}
-    assert p.losses == LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, **zero)
+    assert p.losses == recipe.LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, **zero)
     constant = {"quats": 1e-3, "scales": 5e-3, "opacities": 0.025, "gammas": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
-    assert p.rates == LearningRates(means=(1.6e-4, 1.6e-6), grid=(1e-3, 1e-5), mlp=(1e-3, 1e-3), **constant)
+    assert p.rates == recipe.LearningRates(means=(1.6e-4, 1.6e-6), grid=(1e-3, 1e-5), mlp=(1e-3, 1e-3), **constant)
     sizes = {"levels": 16, "table_size": 2**20, "features": 2, "width": 64, "hidden_layers": 2, "sh_degree": None}
     ends = {"min_resolution": 16.0, "max_resolution": 256.0}
     assert dataclasses.asdict(p.texture) == sizes | ends | {"residual": False, "down_weighting": True}
@@ -114,7 +104,7 @@ def test_runs_from_before_a_setting_keep_what_they_did():
     written = Config().as_dict()
     assert config_from_dict(written) == Config()
     del written["densify"]["relocate"]
-    assert config_from_dict(written).densify == dataclasses.replace(DensifyConfig(), relocate=0.0)
+    assert config_from_dict(written).densify == dataclasses.replace(recipe.DensifyConfig(), relocate=0.0)
     del written["skybox"], written["teachers"]
     found = config_from_dict(written)
     assert (found.skybox, found.teachers, Config().teachers) == (0, 0, None)

@@ -10,17 +10,9 @@ from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.run.folder import keep_camera_path
 from nexwarp.viewer import session as session_module
 from nexwarp.viewer import viewer as viewer_module
+from nexwarp.viewer import world as world_module
 from nexwarp.viewer.pacing import SMALLEST, Pace, Share
-from nexwarp.viewer.world import (
-    LARGEST_FRUSTUM,
-    SMALLEST_FRUSTUM,
-    Viewpoint,
-    World,
-    camera_to_world,
-    clearest,
-    frustum_size,
-    vertical_fov,
-)
+from nexwarp.viewer.world import Viewpoint, World, camera_to_world, clearest, frustum_size, vertical_fov
 from tests.viewer.support import Client, ring, serving, wait_for
 
 
@@ -156,5 +148,6 @@ def test_the_first_view_has_the_other_cameras_behind_it() -> None:
 @pytest.mark.parametrize("spacing", [0.1, 0.2, 1.0])
 def test_frustums_of_neighbours_stay_apart(spacing: float) -> None:
     places = spacing * np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0), [0.0]), axis=-1).reshape(-1, 3)
-    assert frustum_size(places) == pytest.approx(min(0.4 * spacing, LARGEST_FRUSTUM))
-    assert frustum_size(np.zeros((9, 3))) == SMALLEST_FRUSTUM and frustum_size(np.zeros((1, 3))) == LARGEST_FRUSTUM
+    assert frustum_size(places) == pytest.approx(min(0.4 * spacing, world_module.LARGEST_FRUSTUM))
+    assert frustum_size(np.zeros((9, 3))) == world_module.SMALLEST_FRUSTUM
+    assert frustum_size(np.zeros((1, 3))) == world_module.LARGEST_FRUSTUM
