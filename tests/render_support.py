@@ -10,6 +10,7 @@ from nexwarp import ops
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.render import draw as draw_parts
 from tests.narrowing import present, total
+from tests.reference import collect
 from tests.reference import render as reference
 from tests.reference.collect import Shape, View
 from tests.scenes import Scene, make_camera, make_surfels, make_texture, random_scene
@@ -164,6 +165,4 @@ def assert_gradients(actual: torch.nn.Module, expected: torch.nn.Module, row: to
 
 def rays_of(camera: nw.Camera) -> torch.Tensor:
     """(H, W, 3) rays of a pinhole camera, of z-depth 1."""
-    y, x = torch.meshgrid(torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij")
-    x, y = x.to(camera.viewmat), y.to(camera.viewmat)
-    return torch.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, torch.ones_like(x)], -1)
+    return collect.rays_of(view_of(camera), camera.viewmat).reshape(camera.height, camera.width, 3)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from scipy.spatial.transform import Rotation
 
 import nexwarp as nw
 from nexwarp.model.surfels import Activated
@@ -37,7 +38,7 @@ def intrinsics(fx: float, fy: float, cx: float, cy: float) -> torch.Tensor:
     return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
 
 
-def finish(scene: Scene, dtype: torch.dtype, device: torch.device | str) -> Scene:
+def finish(scene: Scene, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Scene:
     """Cast and move every tensor of `scene`, rounded to float32 unless it must stay rigid."""
     tensors = {key: value for key, value in scene.items() if isinstance(value, torch.Tensor)}
     rounded = {key: value if key == "viewmat" else value.float() for key, value in tensors.items()}
@@ -45,19 +46,11 @@ def finish(scene: Scene, dtype: torch.dtype, device: torch.device | str) -> Scen
 
 
 def random_scene(
-    count: int = 24,
-    *,
-    seed: int = 0,
-    width: int = 23,
-    height: int = 18,
-    sh_degree: int = 3,
-    off_centre: bool = False,
-    dtype: torch.dtype = torch.float32,
-    device: torch.device | str = "cpu",
+    count: int = 24, *, seed: int = 0, width: int = 23, height: int = 18, sh_degree=3, off_centre=False, **kind: Any
 ) -> Scene:
     """Make `count` surfels of all orientations in front of a turned camera, opacities well above 1/255.
 
-    `off_centre` puts the principal point outside the image and makes fx and fy differ.
+    `off_centre` puts the principal point outside the image and makes fx and fy differ; `kind` is for `finish`.
     """
     generator = torch.Generator().manual_seed(seed)
     fx, fy, cx, cy = (31.0, 22.0, -4.25, height + 3.5) if off_centre else (24.0, 24.0, width / 2, height / 2)
@@ -79,12 +72,10 @@ def random_scene(
         "height": height,
         "near": 0.01,
     }
-    return finish(scene, dtype, device)
+    return finish(scene, **kind)
 
 
-def layered_scene(
-    count: int = 16, *, seed: int = 0, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
-) -> Scene:
+def layered_scene(count: int = 16, *, seed: int = 0, **kind: Any) -> Scene:
     """Make opaque sheets one behind the other, so that the transmittance reaches 1e-4 and the walk stops.
 
     Every third opacity lies above the cap of 0.99.
@@ -96,25 +87,20 @@ def layered_scene(
     lateral = uniform(generator, count, 2, low=-0.3, high=0.3)
     opacities = uniform(generator, count, low=0.8, high=0.97)
     opacities[::3] = 0.999
-    tilt = torch.cat([torch.ones(count, 1), 0.05 * torch.randn(count, 3, generator=generator)], dim=-1)
+    tilt = torch.cat([0.05 * torch.randn(count, 3, generator=generator), torch.ones(count, 1)], dim=-1)  # xyzw
+    turned = Rotation.from_quat([-0.2, 0.3, -0.1, 0.9]) * Rotation.from_quat(tilt)  # almost to the camera
     scene |= {
         "means": (torch.cat([lateral, z[:, None]], dim=-1) - viewmat[:3, 3]) @ viewmat[:3, :3],
-        "quats": multiply(torch.tensor([[0.9, -0.2, 0.3, -0.1]]).double(), tilt.double()),
+        "quats": torch.from_numpy(turned.as_quat()[:, [3, 0, 1, 2]]),
         "scales": uniform(generator, count, 2, low=0.8, high=2.0),
         "opacities": opacities,
         "gammas": uniform(generator, count, 2, low=1.5, high=4.0),
     }
-    return finish(scene, dtype, device)
+    return finish(scene, **kind)
 
 
 def facing_scene(
-    *surfels: tuple[float, float],
-    scale: float = 100.0,
-    gamma: float = 1.0,
-    size: tuple[int, int],
-    focal: float = 24.0,
-    dtype: torch.dtype = torch.float32,
-    device: torch.device | str = "cpu",
+    *surfels: tuple[float, float], size: tuple[int, int], scale=100.0, gamma=1.0, focal=24.0, **kind: Any
 ) -> Scene:
     """Make surfels (z-depth, opacity) on the axis of a camera at the origin, which they face."""
     count, (width, height) = len(surfels), size
@@ -129,7 +115,7 @@ def facing_scene(
         "viewmat": torch.eye(4),
         "K": intrinsics(focal, focal, width / 2, height / 2),
     }
-    moved = {name: x.to(device=device, dtype=dtype) for name, x in scene.items()}
+    moved = {name: x.to(**{"dtype": torch.float32} | kind) for name, x in scene.items()}  # not rounded
     return moved | {"width": width, "height": height, "near": 0.01}
 
 
@@ -149,19 +135,6 @@ def named_scene(name: str, dtype: torch.dtype, device: torch.device | str) -> Sc
     return scene
 
 
-def multiply(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Hamilton product (N, 4), wxyz."""
-    aw, ax, ay, az = a.unbind(-1)
-    bw, bx, by, bz = b.unbind(-1)
-    product = [
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ]
-    return torch.stack(product, dim=-1)
-
-
 def make_surfels(scene: Scene) -> nw.Surfels:
     return nw.Surfels.from_activated(*(scene[key] for key in SURFEL_KEYS))
 
@@ -177,17 +150,10 @@ def make_camera(scene: Scene, **changes: Any) -> nw.Camera:
     return nw.Camera(**(values | {"viewmat": values["viewmat"].detach().clone().requires_grad_()}))
 
 
-def make_texture(
-    *,
-    seed: int = 0,
-    sh_degree: int = 3,
-    residual: bool = False,
-    dtype: torch.dtype = torch.float32,
-    device: torch.device | str = "cpu",
-) -> nw.NeuralTexture:
+def make_texture(*, seed: int = 0, sh_degree: int = 3, residual=False, device="cpu", dtype=torch.float32):
     """Make a small field with random features and matrices, large enough to be seen in the image."""
     shape = {"width": 16, "hidden_layers": 2, "sh_degree": sh_degree, "residual": residual}
-    texture = nw.NeuralTexture(4, 2**8, 2, 1.0, 6.0, **shape)  # type: ignore[arg-type]
+    texture = nw.NeuralTexture(4, 2**8, 2, 1.0, 6.0, **shape)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         texture.grid.copy_(torch.randn(texture.grid.shape, generator=generator))

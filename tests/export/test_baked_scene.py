@@ -20,7 +20,8 @@ from nexwarp.ops.atlas import Cut
 from tests.export.web import support
 from tests.export.web.support import as_stored, psnr, ring, ring_model
 from tests.narrowing import present
-from tests.reference.collect import rotations
+from tests.reference.collect import rays_of, rotations
+from tests.render_support import view_of
 from tests.scenes import make_camera, make_surfels, random_scene
 from tests.tolerances import assert_close
 
@@ -60,9 +61,7 @@ def by_definition(scene: BakedScene, camera: nw.Camera) -> torch.Tensor:
     """The image (H, W, 3) in float64, differentiable: every surfel at every pixel, without detail limits."""
     shape, frames = scene.shape, rotations(scene.shape.quats.double())
     viewmat, eye = camera.viewmat.detach().double(), camera.position.detach().double()
-    y, x = torch.meshgrid(torch.arange(camera.height).double(), torch.arange(camera.width).double(), indexing="ij")
-    rays = torch.stack([(x + 0.5 - camera.cx) / camera.fx, (y + 0.5 - camera.cy) / camera.fy, torch.ones_like(x)], -1)
-    rays = rays.reshape(-1, 3) @ viewmat[:3, :3]
+    rays = rays_of(view_of(camera), viewmat) @ viewmat[:3, :3]
     depths = ((shape.means - eye) * frames[:, :, 2]).sum(1) / (rays @ frames[:, :, 2].T)
     offsets = eye + depths[..., None] * rays[:, None] - shape.means
     local = torch.einsum("pni,nij->pnj", offsets, frames)[..., :2] / shape.scales

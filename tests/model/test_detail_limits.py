@@ -35,31 +35,24 @@ def limited(
     return draw_parts(surfels, texture, camera, nw.RenderOptions(**changes), limits=limits)
 
 
-def test_a_closer_look_finds_the_detail_of_training(device: torch.device) -> None:
-    """A hit closer than the surfel's nearest limit is textured as from there; one further away as without."""
+def test_looks_beyond_those_of_training_have_their_detail(device: torch.device) -> None:
+    """A hit closer than the surfel's nearest limit, or beyond its farthest, is textured as from there.
+
+    One further away than the nearest is textured as without; one that training never had, not at all.
+    """
     scene = random_scene(device=device)
     surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
     texture.half_precision = False
-    plain = nw.render(surfels, texture, camera, max_hits=3)
-    out = limited(surfels, texture, camera, limits(surfels, nearest=3.5 / camera.focal), max_hits=3)
-    assert_same(out, plain, ("plain", "depths", "weights", "alpha"))
-    expected = textured_at(texture, camera, out, out.depths.clamp_min(3.5))
-    assert_close(out.textured, expected, kind="value", name="textured")
-    far = (out.ids < 0) | (out.depths > 3.5)
-    assert_close(out.textured[far.all(-1)], plain.textured[far.all(-1)], kind="value", name="far")
-
-
-def test_a_farther_look_keeps_the_detail_of_training(device: torch.device) -> None:
-    """A hit beyond the surfel's farthest limit is textured as from there; one that training never had, not at all."""
-    scene = random_scene(device=device)
-    surfels, texture, camera = make_surfels(scene), make_texture(device=device), make_camera(scene)
-    texture.half_precision = False
-    farthest = 3.5 / camera.focal
-    out = limited(surfels, texture, camera, limits(surfels, farthest=farthest), max_hits=3)
-    expected = textured_at(texture, camera, out, out.depths.clamp_max(3.5))
-    assert_close(out.textured, expected, kind="value", name="textured")
+    plain, limit = nw.render(surfels, texture, camera, max_hits=3), 3.5 / camera.focal
+    close = limited(surfels, texture, camera, limits(surfels, nearest=limit), max_hits=3)
+    away = limited(surfels, texture, camera, limits(surfels, farthest=limit), max_hits=3)
+    for out, depths in ((close, close.depths.clamp_min(3.5)), (away, away.depths.clamp_max(3.5))):
+        assert_close(out.textured, textured_at(texture, camera, out, depths), kind="value", name="textured")
+    assert_same(close, plain, ("plain", "depths", "weights", "alpha"))
+    far = ((close.ids < 0) | (close.depths > 3.5)).all(-1)
+    assert_close(close.textured[far], plain.textured[far], kind="value", name="far")
     texture.residual = True
-    none = limits(surfels, nearest=NEVER, farthest=farthest)
+    none = limits(surfels, nearest=NEVER, farthest=limit)
     never, plain = (limited(surfels, each, camera, none) for each in (texture, None))
     assert_close(never.image, plain.image, kind="value", name="never textured")
 

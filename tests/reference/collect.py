@@ -88,21 +88,11 @@ def rotations(quats: torch.Tensor) -> torch.Tensor:
     return torch.stack(rows, dim=-1).reshape(-1, 3, 3)
 
 
-def pixel_centers(width: int, height: int, like: torch.Tensor) -> torch.Tensor:
-    """Pixel coordinates (H * W, 2) of the pixel centres, row by row."""
-    x, y = (torch.arange(size, dtype=like.dtype, device=like.device) + 0.5 for size in (width, height))
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
-
-
-def camera_rays(pixels: torch.Tensor, fx: float, fy: float, cx: float, cy: float) -> torch.Tensor:
-    """Camera-frame directions (P, 3) with z = 1 through `pixels` (P, 2)."""
-    x, y = pixels.unbind(-1)
-    return torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], dim=-1)
-
-
 def rays_of(view: View, like: torch.Tensor) -> torch.Tensor:
-    """Camera-frame directions (H * W, 3) with z = 1 through the pixel centres."""
-    return camera_rays(pixel_centers(view.width, view.height, like), view.fx, view.fy, view.cx, view.cy)
+    """Camera-frame directions (H * W, 3) with z = 1 through the pixel centres, row by row."""
+    x, y = (torch.arange(size, dtype=like.dtype, device=like.device) + 0.5 for size in (view.width, view.height))
+    x, y = torch.meshgrid((x - view.cx) / view.fx, (y - view.cy) / view.fy, indexing="xy")
+    return torch.stack([x, y, torch.ones_like(x)], dim=-1).reshape(-1, 3)
 
 
 def power(u: torch.Tensor, gamma: torch.Tensor) -> torch.Tensor:

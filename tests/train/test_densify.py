@@ -48,9 +48,19 @@ def rows_of(surfels: nw.Surfels) -> dict[str, torch.Tensor]:
     return {name: getattr(surfels, name).detach().clone() for name in PARAMETERS}
 
 
-def moments_of(surfels: nw.Surfels, optimizer: torch.optim.Adam) -> dict[tuple[str, str], torch.Tensor]:
+def moments_of(surfels: nw.Surfels, optimizer: torch.optim.Adam) -> dict[str, torch.Tensor]:
     state = optimizer.state
-    return {(name, key): state[getattr(surfels, name)][key].clone() for name in PARAMETERS for key in MOMENTS}
+    return {f"{key} of {name}": state[getattr(surfels, name)][key].clone() for name in PARAMETERS for key in MOMENTS}
+
+
+def state_of(surfels: nw.Surfels, optimizer: torch.optim.Adam) -> dict[str, torch.Tensor]:
+    return rows_of(surfels) | moments_of(surfels, optimizer)
+
+
+def assert_rows(now: dict[str, torch.Tensor], rows: Any, before: dict[str, torch.Tensor], old_rows: Any) -> None:
+    """Fail unless some rows are what others were before."""
+    for name, values in now.items():
+        assert torch.equal(values[rows], before[name][old_rows]), name
 
 
 def sharp_kernel(surfels: nw.Surfels, row: int, points: torch.Tensor, gamma: float = 400.0) -> torch.Tensor:
@@ -113,18 +123,16 @@ def test_children_tile_their_parent():
 
 def test_split_copies_everything_else_and_leaves_others_alone():
     surfels, optimizer = make(20, seed=1)
-    old, before = rows_of(surfels), moments_of(surfels, optimizer)
+    old = state_of(surfels, optimizer)
     chosen = torch.tensor([0, 6, 13])
     others = [i for i in range(20) if i not in chosen.tolist()]
     split(surfels, optimizer, chosen)
-    for name in PARAMETERS:
-        assert torch.equal(getattr(surfels, name)[others], old[name][others]), name
-    for name in COPIED:
-        assert torch.equal(getattr(surfels, name)[chosen], old[name][chosen]), name
-        assert torch.equal(getattr(surfels, name)[20:], old[name][chosen]), name
+    now = state_of(surfels, optimizer)
+    assert_rows(now, others, old, others)
+    for rows in (chosen, slice(20, None)):
+        assert_rows({name: now[name] for name in COPIED}, rows, old, chosen)
     for key, moments in moments_of(surfels, optimizer).items():
-        assert len(moments) == 23, key
-        assert torch.equal(moments[others], before[key][others]) and bool((before[key][others] != 0).all()), key
+        assert len(moments) == 23 and bool((moments[others] != 0).all()), key
         assert not moments[chosen].any() and not moments[20:].any(), key
 
 
@@ -170,15 +178,11 @@ def test_prune_removes_exactly_the_transparent_ones():
         surfels.logit_opacities.copy_(
             torch.tensor([0.001, 0.0049, 0.0051, 0.5, 0.99, 1e-6, 0.006, 0.004999]).double().logit().float()
         )
-    old, moments = rows_of(surfels), moments_of(surfels, optimizer)
+    old = state_of(surfels, optimizer)
     densifier = densifier_of(surfels, budget=8)
     densifier.accumulate(torch.tensor([1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0]))  # no error of those that stay
     assert counts(densifier.step(optimizer, generator()), 8) == (0, 4)
-    kept = [2, 3, 4, 6]
-    for name in PARAMETERS:
-        assert torch.equal(getattr(surfels, name), old[name][kept]), name
-    for key, now in moments_of(surfels, optimizer).items():
-        assert torch.equal(now, moments[key][kept]), key
+    assert_rows(state_of(surfels, optimizer), slice(None), old, [2, 3, 4, 6])
     assert densifier.errors.tolist() == [0.0] * 4
 
 
@@ -202,19 +206,17 @@ def test_at_the_budget_children_take_the_rows_of_pruned_surfels():
     densifier.accumulate(errors)
     unneeded = torch.zeros(20, dtype=torch.bool)
     unneeded[gone[2]] = True
-    before, old, moments = addresses(surfels, optimizer, densifier), rows_of(surfels), moments_of(surfels, optimizer)
+    before, old = addresses(surfels, optimizer, densifier), state_of(surfels, optimizer)
     alone, alone_optimizer = make(20)
     alone.load_state_dict(surfels.state_dict())
     assert counts(densifier.step(optimizer, generator(), unneeded), 20) == (3, 3)
     assert addresses(surfels, optimizer, densifier) == before and not densifier.errors.any()
     split(alone, alone_optimizer, torch.tensor(parents))
     others = [i for i in range(20) if i not in (*gone, *parents)]
-    for name in PARAMETERS:
-        now = getattr(surfels, name)
-        assert torch.equal(now[others], old[name][others]), name
-        assert torch.equal(now[[*parents, *gone]], getattr(alone, name)[[*parents, 20, 21, 22]]), name
-    for key, now in moments_of(surfels, optimizer).items():
-        assert torch.equal(now[others], moments[key][others]) and not now[[*parents, *gone]].any(), key
+    assert_rows(state_of(surfels, optimizer), others, old, others)
+    now, apart = state_of(surfels, optimizer), state_of(alone, alone_optimizer)
+    assert_rows(now, [*parents, *gone], apart, [*parents, 20, 21, 22])
+    assert not any(moments[[*parents, *gone]].any() for moments in moments_of(surfels, optimizer).values())
 
 
 @pytest.mark.parametrize(
@@ -258,14 +260,13 @@ def test_chosen_ones_are_removed_but_never_the_most_opaque():
     surfels, optimizer = make(5)
     with torch.no_grad():
         surfels.logit_opacities.copy_(torch.tensor([0.0, 1.0, -9.0, 2.0, 0.5]))
-    old, moments = rows_of(surfels), moments_of(surfels, optimizer)
+    old = state_of(surfels, optimizer)
     densifier = densifier_of(surfels, fraction=0.0, prune_opacity=0.0)
     densifier.accumulate(torch.arange(5.0))
     assert densifier.step(optimizer, unneeded=torch.zeros(5, dtype=torch.bool)).tolist() == [0, 1, 2, 3, 4]
     kept = [1, 2, 3]
     assert densifier.step(optimizer, unneeded=torch.tensor([True, False, False, True, True])).tolist() == kept
-    assert all(torch.equal(getattr(surfels, name), old[name][kept]) for name in PARAMETERS)
-    assert all(torch.equal(now, moments[key][kept]) for key, now in moments_of(surfels, optimizer).items())
+    assert_rows(state_of(surfels, optimizer), slice(None), old, kept)
     assert densifier.errors.tolist() == [1.0, 2.0, 3.0]
 
 

@@ -1,4 +1,3 @@
-import math
 from typing import Any
 
 import pytest
@@ -7,7 +6,6 @@ from torch.autograd import gradcheck
 
 from nexwarp.cameras.camera import visible_points
 from nexwarp.ops.photometric import depth_term
-from nexwarp.ops.ssim import weighted_dssim as dssim
 from nexwarp.train import losses
 from nexwarp.train.recipe import LossWeights
 from tests.narrowing import present, total
@@ -20,23 +18,6 @@ def images(height: int = 13, width: int = 17, dtype: torch.dtype = torch.float64
     target = torch.rand(height, width, 3, dtype=torch.float64)
     offset = (torch.randint(2, target.shape) * 2 - 1) * (0.05 + 0.2 * torch.rand_like(target))
     return [(target + offset).to(dtype), target.to(dtype)]
-
-
-def test_dssim_of_constant_images_by_hand() -> None:
-    """Away from the border two constant images differ in luminance only: (2 a b + C1) / (a^2 + b^2 + C1)."""
-    a, b, size = 0.3, 0.7, 400
-
-    def constants(size: int) -> tuple[torch.Tensor, torch.Tensor]:
-        full = torch.ones((size, size, 3), dtype=torch.float64)
-        return a * full, b * full
-
-    expected = 1 - (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
-    assert dssim(*constants(size)).item() == pytest.approx(expected, abs=20 / size)
-    one = dssim(*constants(1))
-    g = 1 / sum(math.exp(-(i * i) / 4.5) for i in range(-5, 6)) ** 2
-    variances = g * (1 - g) * (a * a + b * b)
-    top = (2 * g * g * a * b + 1e-4) * (2 * g * (1 - g) * a * b + 9e-4)
-    assert one.item() == pytest.approx(1 - top / ((g * g * (a * a + b * b) + 1e-4) * (variances + 9e-4)), abs=1e-13)
 
 
 def arguments(slots: int = 2) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def png16(file, photo, color=2, alpha=False):
     if alpha:
         values = np.concatenate([values, np.full((*values.shape[:2], 1), 30_000)], axis=-1)
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
-    chunks = [(b"IHDR", struct.pack(">IIBBBBB", room.WIDTH, room.HEIGHT, 16, color, 0, 0, 0))]
+    chunks = [(b"IHDR", struct.pack(">IIBBBBB", photo.shape[1], photo.shape[0], 16, color, 0, 0, 0))]
     chunks += [(b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
     body = b"".join(struct.pack(">I", len(x)) + n + x + struct.pack(">I", zlib.crc32(n + x)) for n, x in chunks)
     file.write_bytes(b"\x89PNG\r\n\x1a\n" + body)
