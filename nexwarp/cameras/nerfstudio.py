@@ -1,8 +1,8 @@
-"""Read and write cameras as nerfstudio's JSON: `transforms.json` of a scene, and camera paths of its viewer.
+"""Cameras in nerfstudio's JSON: camera paths of its viewer, the `transforms.json` of a scene, and values of both.
 
 Their matrices are camera to world with x right, y up, z backward (OpenGL); nexwarp's are world to camera with x right,
-y down, z forward. The world frame is that of the file, in float64; the `applied_transform` and `applied_scale` of a
-transforms.json are inverted. Cameras of a model with a frame of its own (`Camera.origin`) are moved to and from it.
+y down, z forward. The world frame is that of the file, in float64; cameras of a model with a frame of its own
+(`Camera.origin`) are moved to and from it.
 """
 
 import json
@@ -24,7 +24,6 @@ from nexwarp.io.json_files import Json, JsonObject, read_object
 # From OpenGL's camera axes to OpenCV's; its own inverse.
 FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
-PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL")
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
 SINGULAR = 1e-9  # determinants up to this count as zero
 EXACT = 1e-9  # relative difference up to which intrinsics count as centred and square
@@ -121,24 +120,22 @@ def save_camera_path(path: str | os.PathLike[str], cameras: Sequence[Camera], fp
 def load_camera_path(
     path: str | os.PathLike[str], near: float = 0.01, origin: tuple[float, float, float] = WORLD
 ) -> CameraPath:
-    """Read a camera path: nerfstudio's (key `camera_path`), or the frames of a `transforms.json` in their order.
+    """Read a camera path of nerfstudio's viewer.
 
     The cameras are float32 on the CPU, with the near depth `near` in world units, in the frame whose origin has the
-    world coordinates `origin`, such as `Model.origin`. Frames are pinholes without distortion, whose images need not
-    exist. Their intrinsics are those of the frame, else those of the file: `fl_x`, `fl_y` or `camera_angle_x`,
-    `camera_angle_y`; `cx`, `cy` (default: the image centre); `w`, `h`.
+    world coordinates `origin`, such as `Model.origin`.
 
     Raises:
         FileNotFoundError: no such file. ValueError: a key is missing or has an invalid value; the message names the
             frame and key.
     """
     path = Path(path)
-    data = _read(path)
-    if "camera_path" not in data and "frames" in data:
-        return CameraPath(_frames(path, data, near, origin), None)
+    if not path.is_file():
+        raise MissingError(f"{path}: no such file, expected cameras as JSON")
+    data = read_object(path)
     if "camera_path" not in data:
         keys = ", ".join(sorted(data)[:8]) or "none"
-        raise FormatError(f"{path}: expected the key camera_path or frames, found {one_line(keys)}")
+        raise FormatError(f"{path}: expected the key camera_path, found {one_line(keys)}")
     if data.get("camera_type", "perspective") != "perspective":
         raise FormatError(f"{path}: camera_type: expected perspective, got {data['camera_type']!r:.60}")
     width, height = (_size(path, data, key) for key in ("render_width", "render_height"))
@@ -155,28 +152,6 @@ def load_camera_path(
             cx, cy = width / 2, height / 2
         cameras.append(_camera(where, pose, (fx, fy, cx, cy), (width, height), near, origin))
     return CameraPath(cameras, fps)
-
-
-def _frames(path: Path, data: JsonObject, near: float, origin: tuple[float, float, float]) -> list[Camera]:
-    model = data.get("camera_model", "PINHOLE")
-    if model not in PINHOLES:
-        raise FormatError(f"{path}: camera_model: expected one of {', '.join(PINHOLES)}, got {model!r:.60}")
-    undo = torch.eye(4, dtype=torch.float64)
-    if "applied_transform" in data:
-        undo = torch.linalg.inv(matrix_of(str(path), data, "applied_transform"))
-    scale = number_of(path, data, "applied_scale", above=0.0) if "applied_scale" in data else 1.0
-    cameras: dict[str, Camera] = {}
-    for i, frame in enumerate(_list(path, data, "frames")):
-        where = f"{path}: frames[{i}]"
-        pose = matrix_of(where, frame, "transform_matrix")
-        pose[:3, 3] /= scale
-        width, height = (_size(where, merged(frame, data), key) for key in ("w", "h"))
-        intrinsics = intrinsics_of(where, frame, data, width, height)
-        name = one_line(frame.get("file_path", f"{i:04d}"))
-        if name in cameras:
-            raise ValueError(f"{where}.file_path: expected a name of its own, got {name!r} again")
-        cameras[name] = _camera(where, undo @ pose, intrinsics, (width, height), near, origin)
-    return list(cameras.values())
 
 
 def _camera_to_world(camera: Camera) -> torch.Tensor:
@@ -241,14 +216,8 @@ def _camera(
         raise ValueError(f"{where}: {error}") from None
 
 
-def _read(path: Path) -> JsonObject:
-    if not path.is_file():
-        raise MissingError(f"{path}: no such file, expected cameras as JSON")
-    return read_object(path)
-
-
 def _list(path: Path, data: JsonObject, key: str) -> list[JsonObject]:
-    entries = data[key]
+    entries = data.get(key)
     if not isinstance(entries, list) or not 0 < len(entries) <= MAX_CAMERAS:
         expected = f"a list of at least one camera, at most {MAX_CAMERAS:,}"
         raise FormatError(f"{path}: {key}: expected {expected}, got {one_line(entries, 60)}")

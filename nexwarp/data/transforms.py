@@ -51,7 +51,6 @@ PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RAD
 RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of COLMAP's FULL_OPENCV
 FISHEYE = ("k1", "k2", "k3", "k4")
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
-DISTORTION_PARAMS = ("k1", "k2", "k3", "k4", "p1", "p2")  # in the order of nerfstudio's list
 # Keys of lenses and shutters; what is not read of them would change the picture.
 OPTICAL = re.compile(
     r"[kpsb]\d*|tau_?[xy\d]*|xi|skew|(radial|tangential|principal|focal|transform_matrix_)\w*"
@@ -59,7 +58,7 @@ OPTICAL = re.compile(
     re.IGNORECASE,
 )
 LENS_KEYS = {*RADIAL_TANGENTIAL, "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"}
-LENS_KEYS |= {"camera_model", "is_fisheye", "is_equirectangular", "equirectangular", "distortion_params"}
+LENS_KEYS |= {"camera_model", "is_fisheye", "is_equirectangular", "equirectangular"}
 
 
 @dataclass(frozen=True)
@@ -304,7 +303,7 @@ def _frame_lens(where: str, frame: JsonObject, shared: JsonObject, file: Path) -
     if any(side != int(side) or side < 1 for side in (columns, rows)):
         raise ValueError(f"{where}: w, h: expected whole numbers of pixels, got {columns:g}x{rows:g}")
     width, height = int(columns), int(rows)
-    model, coefficients = _distortion(where, _with_list(where, frame, shared))
+    model, coefficients = _distortion(where, keys)
     try:
         if model == PANORAMA:
             return Lens(model, (float(width), float(height)), width, height)
@@ -330,23 +329,6 @@ def lens_keys(lens: Lens, width: int, height: int) -> JsonObject | None:
     across, along = width / lens.width, height / lens.height
     keys: JsonObject = {"camera_model": model, "fl_x": fx * across, "fl_y": fy * along, "cx": cx * across}
     return {**keys, "cy": cy * along, "w": width, "h": height, **dict(zip(names, coefficients, strict=False))}
-
-
-def _with_list(where: str, frame: JsonObject, shared: JsonObject) -> JsonObject:
-    """The keys of a frame and its file, with nerfstudio's list of coefficients under their names."""
-    levels = []
-    for keys in (frame, shared):
-        coefficients = keys.get("distortion_params")
-        if coefficients is None:
-            levels.append(keys)
-            continue
-        if not isinstance(coefficients, list) or len(coefficients) > len(DISTORTION_PARAMS):
-            expected = f"a list of {', '.join(DISTORTION_PARAMS)}"
-            raise ValueError(f"{where}: distortion_params: expected {expected}, got {short(coefficients)}")
-        if any(keys.get(key) for key in RADIAL_TANGENTIAL):
-            raise ValueError(f"{where}: distortion_params: expected them or k1, k2 and so on, got both")
-        levels.append({**keys, **dict(zip(DISTORTION_PARAMS, coefficients, strict=False))})
-    return merged(*levels)
 
 
 def _distortion(where: str, keys: JsonObject) -> tuple[str, list[float]]:

@@ -50,8 +50,8 @@ class RenderOrder:
     """What `nexwarp render` shows, and how."""
 
     path: Annotated[str | None, option("PATH", "ellipse or interpolate")] = None
-    """Camera path: ellipse, interpolate, or FILE.json, a nerfstudio camera path or a transforms.json. By
-    default an ellipse if the cameras surround what they look at, otherwise interpolate."""
+    """Camera path: ellipse, interpolate, or FILE.json, a camera path of nerfstudio. By default an ellipse if the
+    cameras surround what they look at, otherwise interpolate."""
     video: Annotated[Path | None, option("FILE", "none")] = None
     """Also write the path as a video: .mp4, .mov, .mkv (H.264) or .webm (VP9). Needs the extra `video`."""
     frames: Annotated[int | None, option("N", "120, or that of FILE.json")] = None

@@ -18,7 +18,7 @@ from PIL import Image
 
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
-from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
+from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path
 from nexwarp.data.depth_files import read_depth
 from nexwarp.data.images import MAKE, MODEL, read_image, read_mask, read_transparent
 from nexwarp.data.ply import read_ply
@@ -232,8 +232,7 @@ def _run_cameras(folder: Path) -> list[Files]:
 def _camera_path(folder: Path) -> list[Files]:
     cameras = _cameras(folder / "scene")
     save_camera_path(folder / "a" / "path.json", list(cameras.values()))
-    save_transforms(folder / "b" / "path.json", cameras)
-    return [_files(folder / name) for name in "ab"]
+    return [_files(folder / "a")]
 
 
 def _images(folder: Path) -> list[Files]:

@@ -98,7 +98,7 @@ def test_a_json_file_of_any_size_is_not_read(demo, tmp_path):
     path = write_nerfstudio(demo, tmp_path / "scene")
     with (path / "transforms.json").open("r+b") as stream:
         stream.truncate(2**40)  # sparse: it takes no room
-    with pytest.raises(ValueError, match=r"expected at most 33,554,432 bytes of JSON, got 1,099,511,627,776"):
+    with pytest.raises(ValueError, match=r"expected at most 33,554,432 bytes of JSON, got more"):
         load_scene(path)
 
 

@@ -57,7 +57,6 @@ LENSES: dict[str, Any] = {
     "no model named": ({"camera_model": None, **BARREL_K}, radial((), (-0.18, 0.08)), "RADIAL -0.18 0.08"),
     "k3": ({**BARREL_K, "k3": 0.1}, radial((), (-0.18, 0.08, 0.1)), None),
     "Brown's k4": (BROWN, radial((), (-0.18, 0.08, 0.02, 0.15), (), (0.01, 0.0)), None),
-    "a list": ({"distortion_params": [-0.18, 0.08, 0.02, 0.15]}, radial((), (-0.18, 0.08, 0.02, 0.15)), None),
     "rational": (RATIONAL, radial((), BENT, (0.15,)), "FULL_OPENCV -0.18 0.08 0 0 0 0.15 0 0"),
     "k5": ({**BARREL_K, "k4": 0.15, "k5": 0.05}, radial((), BENT, (0.15, 0.05)), None),
     "fisheye": (FISH, radial((0.05, 0.0, 0.0, -0.01)), "OPENCV_FISHEYE 0.05 0 0 -0.01"),
