@@ -117,7 +117,7 @@ class Train:
             self.scene = dataclasses.replace(self.scene, path=self._make_scene(ranks, console))
         run = self.run or Path("runs") / self.scene.name
         with ExitStack() as claim:
-            record, resume = self._plan(run, ranks, claim, console)
+            record, resume = self._plan(run, ranks, claim)
             teachers = [load(path) for path in record.teachers]  # a wrong path is told before photos are read
             start: Start = {}
             # Of a run to resume, the checkpoint has the surfels, and only a texture counts.
@@ -171,14 +171,13 @@ class Train:
                     viewer.finish(f"{record.config.iterations:,} iterations done", lambda: model)
                     show_until_interrupted(viewer, console)
 
-    def _plan(self, run: Path, ranks: Ranks, claim: ExitStack, console: Console) -> tuple[RunRecord, bool]:
+    def _plan(self, run: Path, ranks: Ranks, claim: ExitStack) -> tuple[RunRecord, bool]:
         """Claim the run folder, on rank 0; return the run, the same on all ranks, and whether to resume it."""
         record = None
         resume = False
         if ranks.first:
             self._check()
-            warn = partial(display.warn, console)
-            claimed = claimed_run(run, self.scene, resume=self.resume, overwrite=self.overwrite, warn=warn)
+            claimed = claimed_run(run, self.scene, resume=self.resume, overwrite=self.overwrite)
             resume = claim.enter_context(claimed)
             record = self._record(run, resume, ranks)
         if ranks.size > 1:
@@ -266,8 +265,6 @@ class Train:
         """Raise SettingError for invalid options, before the photos are read."""
         if self.checkpoint_every is not None and self.checkpoint_every < 1:
             raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
-        if self.scene.downscale < 1:
-            raise SettingError(f"--downscale: expected at least 1, got {self.scene.downscale}")
         if self.tensorboard:
             check_tensorboard()
         if self.view:
@@ -302,7 +299,6 @@ class Train:
             ViewerOptions(
                 scene.train[0].camera.near, record.source.name, self.host, self.port, record.config.iterations
             ),
-            photos={f"{group}/{v.name}": partial(getattr, v, "image") for group, views in sets.items() for v in views},
             save_path=partial(keep_camera_path, run, origin=scene.train[0].camera.origin),
         )
         print_url(viewer, console)
@@ -331,8 +327,8 @@ def _naming(flag: str) -> Iterator[None]:
 def _load_scene(record: RunRecord, ranks: Ranks, console: Console) -> Scene:
     """Load the scene, and say what it holds."""
     count = f", {ranks.size} ranks" if ranks.size > 1 else ""
-    with display.loading(console) as progress:
-        scene = record.source.load(progress)
+    with display.stages(console) as observe:
+        scene = record.source.load(partial(observe, "reading photos"))
     size = scene.train[0].camera
     console.print(f"{record.source.name} on {device_name(ranks.device)}{count}, preset {record.config.preset}")
     console.print(

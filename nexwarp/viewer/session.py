@@ -381,10 +381,8 @@ class Session:
                 thickness=1.5,
                 thickness_units="screen",
                 color=COLOURS.get(name.partition("/")[0], (160, 160, 160)),
-                image=self.viewer.thumbnails.get(name),
                 wxyz=_wxyz(pose),
                 position=place,
-                format="jpeg",
                 cast_shadow=False,
                 receive_shadow=False,
             )
@@ -494,7 +492,7 @@ class Session:
         on_click(shot, lambda: self._take_screenshot(height.value))
         if self.viewer.save_path is not None:
             gui.add_divider()
-            self.path = PathEditor(self, self.viewer.keep_path)
+            self.path = PathEditor(self, self.viewer.save_path)
 
     def _edit(self) -> None:
         if self.viewer.measured is not None:

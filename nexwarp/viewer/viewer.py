@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from nexwarp.viewer.security import Gate
 
 SHARE = 0.2  # of a training's time for pictures
-THUMBNAIL_SIDE = 96  # pixels along the longer side
-MOST_PATHS = 100  # written into the run
 log = logging.getLogger(__name__)
 
 
@@ -57,7 +55,6 @@ class Viewer:
         cameras: Mapping[str, Mapping[str, Camera]],
         options: ViewerOptions,
         *,
-        photos: Mapping[str, Callable[[], torch.Tensor]] | None = None,
         save_path: Callable[[Sequence[Camera]], str] | None = None,
         crop_command: Callable[[np.ndarray, float], str] | None = None,
         measured: Callable[[np.ndarray, float], list[str]] | None = None,
@@ -69,7 +66,6 @@ class Viewer:
             model: returns the current model; called for each picture.
             cameras: the scene's cameras by set ("train", "test") and name; may be empty.
             options: title, address and the like.
-            photos: "set/name" -> function that returns the (H, W, 3) uint8 photo, for thumbnails.
             save_path: writes a camera path into the run and returns the command that renders it; None offers none.
             crop_command: returns the command that crops by a sphere, of its centre (3,) and radius; None offers none.
             figures: "set/name" -> PSNR in dB and sharpness of a photo, the worst first; None lists no photos.
@@ -79,7 +75,6 @@ class Viewer:
         self.model, self.options, self.save_path = model, options, save_path
         self.crop_command, self.measured, self.figures = crop_command, measured, figures or {}
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
-        self.photos = photos or {}
         means = model().surfels.means
         placed = list(self.cameras.values()) or surrounding(means, options.near)
         self.world = World.around(placed, means)
@@ -87,8 +82,7 @@ class Viewer:
         self.focal_limit = max((camera.focal for camera in self.cameras.values()), default=math.inf)
         self.pace, self.share = pacing.Pace(), pacing.Share(SHARE)
         self.sessions: dict[int, Session] = {}
-        self.thumbnails: dict[str, np.ndarray] = {}
-        self.step = self.paths = 0
+        self.step = 0
         self.training: TrainingPanel | None = None
         self._news, self._lock = threading.Event(), threading.Lock()
         self.server, self.url, self.gate = start_server(options.host, options.port)
@@ -272,8 +266,6 @@ class Viewer:
 
     def _welcome(self, client: "viser.ClientHandle") -> None:
         try:
-            with self._lock:  # one of the first clients reads the photos
-                self._read_photos()
             session = Session(self, client)
             with self._lock:
                 if client.client_id in self.server.get_clients():  # else it has disconnected
@@ -282,33 +274,11 @@ class Viewer:
         except Exception as error:  # for example out of memory
             client.add_notification("The viewer could not serve this tab: reload it", _reason(error))
 
-    def _read_photos(self) -> None:
-        """Reduce the photos to thumbnails, once; unreadable ones have none."""
-        from PIL import Image
-
-        for name, photo in self.photos.items():
-            try:
-                image = Image.fromarray(photo().numpy())
-                image.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
-                self.thumbnails[name] = np.asarray(image)
-            except (OSError, ValueError, RuntimeError, MemoryError) as error:
-                log.warning("%s has no thumbnail: %s", one_line(name), _reason(error))
-        self.photos = {}
-
     def _goodbye(self, client: "viser.ClientHandle") -> None:
         with self._lock:
             session = self.sessions.pop(client.client_id, None)
         if session is not None:
             session.closed.set()
-
-    def keep_path(self, path: Sequence[Camera]) -> str:
-        """Write a camera path into the run; ValueError if too many are written."""
-        assert self.save_path is not None  # otherwise no panel offers it
-        with self._lock:
-            if self.paths >= MOST_PATHS:
-                raise ValueError(f"a viewer writes at most {MOST_PATHS} paths into the run")
-            self.paths += 1
-        return self.save_path(path)
 
 
 def _kind(settings: Settings) -> tuple[bool, int]:

@@ -9,7 +9,6 @@ import nexwarp as nw
 from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.run.folder import keep_camera_path
 from nexwarp.viewer import session as session_module
-from nexwarp.viewer import viewer as viewer_module
 from nexwarp.viewer import world as world_module
 from nexwarp.viewer.pacing import SMALLEST, Pace, Share
 from nexwarp.viewer.world import Viewpoint, World, camera_to_world, clearest, frustum_size, vertical_fov
@@ -67,9 +66,8 @@ def test_a_browsers_camera_is_the_scenes():
 
 
 def test_a_path_is_played_and_kept_as_its_views_say(model, tmp_path, monkeypatch) -> None:
-    """Views are added and removed; what the run keeps passes through them; numbers of views and paths are bounded."""
+    """Views are added and removed; what the run keeps passes through them; their number is bounded."""
     monkeypatch.setattr(session_module, "MOST_VIEWS", 3)
-    monkeypatch.setattr(viewer_module, "MOST_PATHS", 2)
     with serving(model, save_path=lambda path: keep_camera_path(tmp_path, path)) as viewer, Client(viewer) as client:
         client.look()
         wait_for(lambda: bool(viewer.sessions))
@@ -94,9 +92,6 @@ def test_a_path_is_played_and_kept_as_its_views_say(model, tmp_path, monkeypatch
         asyncio.run(editor.play())
         last = viewer.world.to_scene(np.asarray(session.client.camera.position))
         np.testing.assert_allclose(last, camera_to_world(session.cameras["train/1.png"])[:3, 3], atol=1e-4)
-        editor.keep()
-        editor.keep()
-        assert "at most 2 paths" in editor.note.content and len(list(tmp_path.iterdir())) == 2
 
 
 def test_a_sphere_is_drawn_and_its_command_shown(model) -> None:
