@@ -146,11 +146,11 @@ class Eval:
             lacks = "expected the photos to compare with, got a model alone; give --scene SCENE"
             raise MissingError(f"{self.run}: {lacks}")
         opened.folder.mkdir(exist_ok=True)
-        with locked_run(opened.folder, partial(display.warn, console)):
+        with locked_run(opened.folder):
             opened = open_model(self.run)  # another process may have changed it
             model = opened.trained.to(device)
-            with display.loading(console) as progress:
-                scene = source.load(progress)
+            with display.stages(console) as observe:
+                scene = source.load(partial(observe, "reading photos"))
             if not scene.test:
                 raise SceneError(f"{scene.path}: expected test views, found none")
             views = scene.test
@@ -289,7 +289,7 @@ class Edit:
         if not opened.file.is_file():
             raise MissingError(f"{opened.file}: expected a trained model, found none")
         if self.order != EditOrder():
-            with locked_run(opened.folder, partial(display.warn, console)):
+            with locked_run(opened.folder):
                 opened = open_model(self.run)  # another process may have changed it
                 opened = self._change(opened, device, console)
         for number, edit in enumerate(opened.edits, 1):

@@ -11,7 +11,6 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
@@ -95,26 +94,18 @@ def training(
         yield show
 
 
-def _bars(console: Console, *last: ProgressColumn) -> Progress:
+def _bars(console: Console) -> Progress:
     """Return bars that vanish at their end, shown in a terminal only."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *last)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     return Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
 
 
 @contextmanager
 def counting(console: Console, title: str, total: int) -> Iterator[Callable[..., None]]:
     """Show a progress bar; yield a function to call after each item."""
-    with _bars(console, TimeRemainingColumn()) as progress:
+    with _bars(console) as progress:
         task = progress.add_task(title, total=total)
         yield lambda _name=None: progress.advance(task)
-
-
-@contextmanager
-def loading(console: Console) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar; yield a function to call with the number of photos read and their total."""
-    with _bars(console, TimeRemainingColumn()) as progress:
-        task = progress.add_task("reading photos", total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)
 
 
 @contextmanager
@@ -122,7 +113,7 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
     """Show a bar, or lines in a log file, for each stage; yield a function of its name, items done and total."""
     tasks: dict[str, TaskID] = {}
     shown = time.perf_counter()
-    with _bars(console, TimeElapsedColumn()) as progress:
+    with _bars(console) as progress:
 
         def observe(stage: str, done: int, total: int) -> None:
             nonlocal shown

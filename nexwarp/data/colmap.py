@@ -10,11 +10,11 @@ import dataclasses
 import struct
 import warnings
 from array import array
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -35,10 +35,9 @@ from nexwarp.data.ply import read_ply
 PARTS = ("cameras", "images", "points3D")
 FORMATS = ("bin", "txt")
 POINTS_PLY = "points3D.ply"  # of MASt3R's and DUSt3R's exporters, and of 3DGS
-MAX_CAMERAS = MAX_IMAGES = 100_000
+MAX_IMAGES = 100_000  # and cameras
 MAX_POINTS = 10_000_000
 LARGEST_ID = 2**32 - 1  # of an image, as binary files hold it
-MAX_OBSERVATIONS = 100_000_000
 MAX_NAME = 4096  # bytes
 MAX_LINE = 64 * 2**20  # bytes of a line of a text file, enough for a million keypoints
 KEYPOINT_BYTES = b"0123456789+-.eEinfaINFA \t"  # of numbers, nan and inf
@@ -239,14 +238,9 @@ def _read_binary(
     folder: Path, points: bool
 ) -> tuple[dict[int, CameraRecord], dict[int, ImageRecord], PointRecords | None]:
     """Read cameras and images by id, and the points, if wanted; ValueError names a damaged file."""
-    with _opened(folder / "cameras.bin") as file:
-        cameras = _unique(file.path, (_binary_camera(file) for _ in range(file.count(MAX_CAMERAS))))
-    with _opened(folder / "images.bin") as file:
-        images = _unique(file.path, (_binary_image(file) for _ in range(file.count(MAX_IMAGES))))
-    if not points:
-        return cameras, images, None
-    with _opened(folder / "points3D.bin") as file:
-        return cameras, images, _binary_points(file)
+    cameras = _unique(folder / "cameras.bin", _records(folder / "cameras.bin", _binary_camera, MAX_IMAGES))
+    images = _unique(folder / "images.bin", _records(folder / "images.bin", _binary_image, MAX_IMAGES))
+    return cameras, images, _binary_points(folder / "points3D.bin") if points else None
 
 
 def _count_images(folder: Path, suffix: str) -> int:
@@ -254,64 +248,49 @@ def _count_images(folder: Path, suffix: str) -> int:
     if suffix == "txt":
         return sum(1 for _ in _text_images(folder / "images.txt"))
     with (folder / "images.bin").open("rb") as file:
-        return _Reader(folder / "images.bin", file).count(MAX_IMAGES)
+        return int.from_bytes(file.read(8), "little")
 
 
 class _Reader:
-    """Reads a binary file with checks against its size: it never reads or allocates beyond it."""
+    """A binary file that is mapped into memory, and how far it is read; ValueError where it ends too early."""
 
-    def __init__(self, path: Path, file: BinaryIO) -> None:
-        self.path, self.file, self.size = path, file, path.stat().st_size
-        self.position = 0
+    def __init__(self, path: Path, content: mmap) -> None:
+        self.path, self.content, self.position = path, content, 0
+
+    def skip(self, size: int) -> int:
+        """Go on by some bytes; return where they begin."""
+        start, self.position = self.position, self.position + size
+        if self.position > len(self.content):
+            raise ValueError(f"{self.path}: truncated or damaged, expected more records than the file holds")
+        return start
 
     def read(self, size: int) -> bytes:
-        self._advance(size)
-        data = self.file.read(size)
-        if len(data) < size:
-            raise self._short()
-        return data
-
-    def skip(self, size: int) -> None:
-        self._advance(size)
-        self.file.seek(self.position)
+        return self.content[self.skip(size) : self.position]
 
     def number(self) -> int:
         return int.from_bytes(self.read(8), "little")
 
-    def count(self, limit: int) -> int:
-        count = self.number()
-        if count > self.size - self.position:  # each record has at least one byte
-            raise self._short()
-        if count > limit:
-            raise ValueError(f"{self.path}: expected at most {limit:,} records, got {count:,}")
-        return count
-
     def text(self) -> bytes:
         """Read bytes up to a zero."""
-        start = self.position
-        data, zero, _ = self.file.read(MAX_NAME + 1).partition(b"\0")
-        if not zero and start + MAX_NAME < self.size:
+        end = self.content.find(b"\0", self.position, self.position + MAX_NAME + 1)
+        if end < 0 and len(self.content) > self.position + MAX_NAME:
             raise ValueError(f"{self.path}: damaged, expected image names of at most {MAX_NAME} bytes")
-        self.skip(len(data) + 1)
-        return data
-
-    def _advance(self, size: int) -> None:
-        self.position += size
-        if self.position > self.size:
-            raise self._short()
-
-    def _short(self) -> ValueError:
-        return ValueError(f"{self.path}: truncated or damaged, expected more records than the file holds")
+        return self.read((end if end >= 0 else len(self.content)) - self.position + 1)[:-1]
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[_Reader]:
-    """Open a binary file that is to be read to its end."""
-    with path.open("rb") as file:
-        reader = _Reader(path, file)
-        yield reader
-    if reader.position != reader.size:
-        raise ValueError(f"{path}: damaged, expected {reader.position:,} bytes as its counts say, got {reader.size:,}")
+def _records(path: Path, read: Callable[[_Reader], Record], limit: int) -> Iterator[Record]:
+    """Read the records of a binary file, whose number is its first one, to its end."""
+    if not path.stat().st_size:
+        raise ValueError(f"{path}: truncated or damaged, expected more records than the file holds")
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+        reader = _Reader(path, content)
+        if (count := reader.number()) > limit:
+            raise ValueError(f"{path}: expected at most {limit:,} records, got {count:,}")
+        for _ in range(count):
+            yield read(reader)
+        if reader.position != len(content):
+            sizes = f"expected {reader.position:,} bytes as its counts say, got {len(content):,}"
+            raise ValueError(f"{path}: damaged, {sizes}")
 
 
 def _unique(path: Path, records: Iterator[tuple[int, Record]]) -> dict[int, Record]:
@@ -341,15 +320,18 @@ def _binary_image(file: _Reader) -> tuple[int, ImageRecord]:
     return identity, ImageRecord(tuple(pose), camera, name)
 
 
-def _binary_points(file: _Reader) -> PointRecords:
+def _binary_points(path: Path) -> PointRecords:
     heads, tracks = bytearray(), bytearray()
-    for _ in range(file.count(MAX_POINTS)):
+
+    def read(file: _Reader) -> None:
+        nonlocal heads, tracks
         head = file.read(POINT.size)
         heads += head
-        if length := int.from_bytes(head[-8:], "little"):
-            _check_observations(file.path, len(tracks) // 8 + length)
-            tracks += file.read(8 * length)
-    return _sorted(file.path, heads, np.frombuffer(tracks, "<u4")[::2].copy())
+        tracks += file.read(8 * int.from_bytes(head[-8:], "little"))
+
+    for _ in _records(path, read, MAX_POINTS):
+        pass
+    return _sorted(path, heads, np.frombuffer(tracks, "<u4")[::2].copy())
 
 
 # Text files
@@ -437,7 +419,6 @@ def _text_points(path: Path) -> PointRecords:
             raise _unreadable(where, "id, position, colour, error and track of a point", line) from None
         if len(heads) > MAX_POINTS * POINT.size:
             raise ValueError(f"{path}: expected at most {MAX_POINTS:,} points, got more")
-        _check_observations(path, len(seen_by))
     return _sorted(path, heads, np.frombuffer(seen_by, np.uint32))
 
 
@@ -453,11 +434,6 @@ def _sorted(path: Path, heads: bytearray, seen_by: np.ndarray) -> PointRecords:
     if len(twice):
         raise ValueError(f"{path}: damaged, expected each id once, got {table['id'][twice[0]]} twice")
     return PointRecords(table, seen_by, points)
-
-
-def _check_observations(path: Path, count: int) -> None:
-    if count > MAX_OBSERVATIONS:
-        raise ValueError(f"{path}: expected at most {MAX_OBSERVATIONS:,} observations, got more")
 
 
 def _decoded(path: Path, name: bytes) -> str:

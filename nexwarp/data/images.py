@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 # PIL supports other formats; some of them start other programs.
 FORMATS = ("JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "PPM", "GIF", "TGA", "JPEG2000", "AVIF", "HEIF")
-ROWS = 256  # rows that are converted at a time
 MAX_SUM = 2**32 - 1
 MAX_PIXELS = 178_956_970  # PIL's own error limit, twice its limit for a warning
 # Larger images are refused above a ratio of pixels to bytes that no photo reaches: (2,000, 16,000 for bilevel images).
@@ -283,10 +282,7 @@ def _to_rgba(image: "PIL.Image.Image") -> "PIL.Image.Image":
 def _to_rgb(image: "PIL.Image.Image") -> np.ndarray:
     """Convert a PIL image to (H, W, 3) uint8."""
     if image.mode.startswith("I"):  # 16-bit grey, which PIL's conversion would clip at 255
-        wide = np.asarray(image)
-        grey = np.empty(wide.shape, np.uint8)
-        for top in range(0, len(wide), ROWS):
-            grey[top : top + ROWS] = np.clip((wide[top : top + ROWS].astype(np.int64) + 128) // 257, 0, 255)
+        grey = ((np.asarray(image).clip(0, 65535).astype(np.uint32) + 128) // 257).astype(np.uint8)
         return np.repeat(grey[:, :, None], 3, axis=2)
     if image.mode in ("P", "PA", "La"):  # PIL drops their transparency only through RGBA
         image = _to_rgba(image)

@@ -4,16 +4,14 @@ import errno
 import os
 import re
 import secrets
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from nexwarp.errors import FormatError, StorageError
 
-TEMPORARY = re.compile(r"\..+\.(\d{1,9})-[0-9a-f]{16}\.tmp(\.[^.]*)?")
+TEMPORARY = re.compile(r"\..+\.\d{1,9}-[0-9a-f]{16}\.tmp(\.[^.]*)?")
 MAX_STEM = 40  # characters of a file's stem in its temporary name; a file system may limit names to 255 bytes
-STALE_SECONDS = 600.0
 LONGEST_HEADER = 2**20  # bytes; that of a model has about 5,000
 # Errors of fsync on folders of file systems that cannot sync them, and of open on folders that may not be read.
 UNSYNCABLE = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
@@ -38,20 +36,6 @@ def temporary_name(path: Path) -> Path:
 def is_temporary(name: str) -> bool:
     """Whether a name is one of `temporary_name`."""
     return TEMPORARY.fullmatch(name) is not None
-
-
-def is_abandoned(file: Path) -> bool:
-    """Whether the process of a temporary file has probably ended.
-
-    No such process runs here, and the file has not changed for 10 minutes: the process may run on another host.
-    """
-    import psutil
-
-    match = TEMPORARY.fullmatch(file.name)
-    if match is None or time.time() - file.lstat().st_mtime < STALE_SECONDS:
-        return False
-    process = int(match[1])
-    return process == os.getpid() or not psutil.pid_exists(process)
 
 
 def make_folders(folder: Path) -> list[Path]:

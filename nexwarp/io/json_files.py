@@ -39,10 +39,8 @@ def read_json(path: Path, *, finite: bool = False) -> Any:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file, expected JSON")
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise ValueError(f"{path}: expected at most {MAX_BYTES:,} bytes of JSON, got {size:,}")
-    return parse_json(str(path), path.read_bytes(), finite=finite)
+    with path.open("rb") as file:
+        return parse_json(str(path), file.read(MAX_BYTES + 1), finite=finite)
 
 
 def parse_json(where: str, content: bytes, *, finite: bool = False) -> Any:
@@ -52,7 +50,7 @@ def parse_json(where: str, content: bytes, *, finite: bool = False) -> Any:
     not JSON.
     """
     if len(content) > MAX_BYTES:
-        raise ValueError(f"{where}: expected at most {MAX_BYTES:,} bytes of JSON, got {len(content):,}")
+        raise ValueError(f"{where}: expected at most {MAX_BYTES:,} bytes of JSON, got more")
     content = content.removeprefix(codecs.BOM_UTF8)
     steps = np.frombuffer(STRINGS.sub(b"", content).translate(STEPS, OTHERS), np.int8)
     # Each list or object takes about a microsecond and several hundred bytes, whatever it is used for.

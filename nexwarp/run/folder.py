@@ -9,7 +9,8 @@ import errno
 import json
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -30,7 +31,7 @@ from nexwarp.cameras.paths import surrounding
 from nexwarp.cameras.similarity import IDENTITY, Similarity
 from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError, check_version
-from nexwarp.io.files import is_abandoned, is_temporary, make_folders, one_line, remove_empty, sync, written_aside
+from nexwarp.io.files import is_temporary, make_folders, one_line, remove_empty, sync, written_aside
 from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
 from nexwarp.model.crop import select
 from nexwarp.model.edit import EDIT_FILE, Edit, frame_of, kept_surfels, read_edits
@@ -221,22 +222,20 @@ def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool
 
 
 @contextmanager
-def claimed_run(
-    run: Path, source: SceneSource, *, resume: bool, overwrite: bool, warn: Callable[[str], None] = lambda _: None
-) -> Iterator[bool]:
+def claimed_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool) -> Iterator[bool]:
     """Check a run folder as `prepare_run` does, and lock it for a training; yield whether there is a run to resume."""
     prepare_run(run, source, resume=resume, overwrite=overwrite)  # before a lock is written to a foreign folder
-    with locked_run(run, warn):
+    with locked_run(run):
         yield prepare_run(run, source, resume=resume, overwrite=overwrite)  # another process may have changed it
 
 
 @contextmanager
-def locked_run(run: Path, warn: Callable[[str], None] = lambda _: None) -> Iterator[None]:
+def locked_run(run: Path) -> Iterator[None]:
     """Hold the lock of a run folder during the block; RunError where another process or thread holds it.
 
     A missing folder is created, and removed if it is empty at the end. The lock's file, `run.lock`, tells the holder
     and is deleted at the end. A process that is killed leaves the file, but not the lock. Where the file system has no
-    locks, `warn` is told, and the block runs without.
+    locks, a warning says so, and the block runs without.
     """
     lock = FileLock(run / LOCK_FILE, timeout=0, fallback_to_soft=False, on_acquired=_write_holder)
     try:
@@ -244,7 +243,7 @@ def locked_run(run: Path, warn: Callable[[str], None] = lambda _: None) -> Itera
     except OSError as error:
         raise StorageError.at(run, error) from error
     try:
-        _acquire(lock, run, warn)
+        _acquire(lock, run)
         try:
             yield
         finally:
@@ -256,7 +255,7 @@ def locked_run(run: Path, warn: Callable[[str], None] = lambda _: None) -> Itera
         remove_empty(created)
 
 
-def _acquire(lock: BaseFileLock, run: Path, warn: Callable[[str], None]) -> None:
+def _acquire(lock: BaseFileLock, run: Path) -> None:
     path = run / LOCK_FILE
     try:
         lock.acquire()
@@ -270,7 +269,8 @@ def _acquire(lock: BaseFileLock, run: Path, warn: Callable[[str], None]) -> None
         if error.errno not in WITHOUT_LOCKS:
             raise StorageError.at(path, error) from error
         path.unlink(missing_ok=True)
-        warn(f"{run}: its file system has no locks ({error.strerror}): do not start a second training in this folder")
+        text = f"its file system has no locks ({error.strerror}): do not start a second training in this folder"
+        warnings.warn(f"{run}: {text}", stacklevel=2)
 
 
 def _write_holder(file: int) -> None:
@@ -383,8 +383,7 @@ def remove_leftovers(run: Path) -> None:
         folder, _, base = name.rpartition("/")
         # Others are written without the lock: their processes may still be at work.
         locked = folder in CHECKPOINTS or (not folder and not base.startswith(".camera_path_"))
-        is_leftover = is_temporary(base) and (locked or is_abandoned(run / name))
-        if is_leftover or re.fullmatch(_ASIDE, folder):
+        if (is_temporary(base) and locked) or re.fullmatch(_ASIDE, folder):
             leftovers.append(name)
     _delete(run, leftovers)
     remove_empty([folder for folder in run.iterdir() if re.fullmatch(_ASIDE, folder.name)])

@@ -158,7 +158,7 @@ def test_counts_are_checked_before_they_are_believed(tmp_path, name):
     good = file.read_bytes()
     for count in (2**20, 2**40, 2**64 - 1):
         overwrite(file, 0, struct.pack("<Q", count))
-        refused(path, rf"{name}\.bin: truncated or damaged, expected more records than the file holds")
+        refused(path, rf"{name}\.bin: (truncated or damaged, expected more records than|expected at most)")
     for size in range(0, len(good), max(len(good) // 40, 1)):
         file.write_bytes(good[:size])
         refused(path, rf"{name}\.bin: truncated or damaged")
@@ -248,7 +248,7 @@ def test_json_is_bounded(monkeypatch):
     with pytest.raises(ValueError, match="NaN is no JSON number"):
         parse_json("x", b"[NaN]", finite=True)
     monkeypatch.setattr(json_files, "MAX_BYTES", 10)
-    with pytest.raises(ValueError, match="x: expected at most 10 bytes of JSON, got 11"):
+    with pytest.raises(ValueError, match="x: expected at most 10 bytes of JSON, got more"):
         parse_json("x", b" " * 11)
 
 

@@ -1,15 +1,13 @@
 import os
 import shutil
 import threading
-import time
-from pathlib import Path
 
 import pytest
 import torch
 
 from nexwarp.errors import StorageError
 from nexwarp.io import files
-from nexwarp.io.files import is_abandoned, is_temporary, temporary_name, write_atomically, write_together, written_aside
+from nexwarp.io.files import is_temporary, temporary_name, write_atomically, write_together, written_aside
 from nexwarp.run.folder import keep_camera_path
 from nexwarp.run.log import _open_log
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
@@ -49,19 +47,6 @@ def test_long_names_leave_room_for_what_a_temporary_name_adds(tmp_path):
     for stem in ("n" * 250, "é" * 125):
         write_atomically(tmp_path / f"{stem}.png", b"")
     assert len(os.listdir(tmp_path)) == 2
-
-
-def test_a_temporary_file_is_abandoned_when_it_is_old_and_its_process_is_gone(tmp_path):
-    def file(process: int, age: float) -> Path:
-        made = tmp_path / f".a.{process}-{0:016x}.tmp"
-        made.touch()
-        os.utime(made, (time.time() - age,) * 2)
-        return made
-
-    assert is_abandoned(file(2**22 + 1, 3600)) and is_abandoned(file(999_999_999, 3600))
-    assert not is_abandoned(file(2**22 + 1, 10))  # perhaps of another host
-    assert not is_abandoned(file(os.getppid(), 3600))
-    assert is_abandoned(file(os.getpid(), 3600))  # of an earlier process with this number: in a container all have one
 
 
 def test_folders_of_a_failed_write_are_removed(tmp_path):

@@ -309,6 +309,11 @@ def _read_depths(folder: Path) -> None:
     assert bool(torch.isfinite(depth).all()) and bool((depth >= 0).all())
 
 
+def _read_photos(folder: Path) -> None:
+    with tempfile.TemporaryDirectory() as prepared:
+        camera_groups(folder, read_photos(folder, ["a.jpg"], 1, lambda _: None, Path(prepared))[0], "auto")
+
+
 def _linear(folder: Path) -> list[Files]:
     save_exr(folder / "a.exr", {"image": torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))})
     _noise(3).save(folder / "a.png")
@@ -340,7 +345,7 @@ TARGETS = {
         FuzzTarget(
             "photos",
             _photo_files,
-            lambda folder: camera_groups(folder, read_photos(folder, ["a.jpg"], 1, lambda _: None)[0], "auto"),
+            _read_photos,
             (".jpg",),
         ),
         FuzzTarget("baked", _baked, _read_baked, (".nxb", ".glb")),

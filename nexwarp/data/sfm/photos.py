@@ -7,9 +7,9 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
 
 from nexwarp.data.capture import safe_name, short
 from nexwarp.data.images import (
@@ -38,8 +38,6 @@ MANY = 5  # photos of one camera that determine the eight parameters of OPENCV
 PIXEL_BYTES = 12  # of memory, to decode or undistort a photo, a pixel
 FEATURE_BYTES = 240  # of memory, to find SIFT features, a pixel of the reduced photo
 MOST_DECODED = 2 * GIB  # memory of the photos that are decoded at once, if there are several
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,11 @@ def affordable_threads(folder: Path, names: Sequence[str], options: SfmOptions) 
 
     OutOfMemoryError: there is too little memory for the largest photo.
     """
-    name, pixels = max(((name, math.prod(image_size(folder / name))) for name in names), key=lambda item: item[1])
+    sizes = {"": 1}
+    for name in names:
+        with suppress(ValueError):  # one that cannot be read is left out later
+            sizes[name] = math.prod(image_size(folder / name))
+    name, pixels = max(sizes.items(), key=lambda item: item[1])
     searched = min(pixels, options.max_image_size**2)
     each = PIXEL_BYTES * pixels + FEATURE_BYTES * searched
     free = available_memory()
@@ -117,85 +119,55 @@ def affordable_threads(folder: Path, names: Sequence[str], options: SfmOptions) 
     return max(1, min(most, int(SHARE * free) // each, max(MOST_DECODED // (PIXEL_BYTES * pixels), 1)))
 
 
-def read_each(
-    folder: Path,
-    names: Sequence[str],
-    read: Callable[[str], T],
-    strict: bool,
-    done: Callable[[int], None] = lambda count: None,
-) -> tuple[dict[str, T], dict[str, str]]:
-    """Return what `read` gives for each photo, and the reasons of those for which it raises ValueError.
+def read_photos(
+    folder: Path, names: Sequence[str], threads: int, done: Callable[[int], None], prepared: Path, strict: bool = True
+) -> tuple[list[InputPhoto], dict[str, str]]:
+    """Decode every photo, `threads` at once, and read its EXIF; return also name -> reason of those that fail.
 
-    `done` is called with the number of photos that were read or skipped. ValueError: fewer than 3 photos are left, or,
+    `prepared` gets what pycolmap is to read: links to the photos, and copies of those that are turned or no format of
+    pycolmap. `done` is called with the number of photos that were read. ValueError: fewer than 3 photos are left, or,
     if `strict`, one cannot be read.
     """
-    results: dict[str, T] = {}
+    photos: list[InputPhoto] = []
     skipped: dict[str, str] = {}
-    for count, name in enumerate(names, start=1):
-        try:
-            results[name] = read(name)
-        except ValueError as error:
-            if strict or isinstance(error.__cause__, MemoryError):
-                raise
-            skipped[name] = str(error).removeprefix(f"{folder / name}: ")
-        done(count)
-    if skipped and len(results) < MIN_PHOTOS:
-        name, reason = next(iter(skipped.items()))
-        raise ValueError(
-            f"{folder}: expected at least {MIN_PHOTOS} photos that can be read, found {len(results) or 'none'} of "
-            f"{len(names)}; {name}: {reason}"
-        )
-    return results, skipped
-
-
-def is_copied(file: Path) -> bool:
-    """Whether pycolmap needs a copy of a photo: upright, or as JPEG; errors are those of `read_image`."""
-    return is_turned(file) or file.suffix.lower() in CONVERTED
-
-
-def read_photos(
-    folder: Path,
-    names: Sequence[str],
-    threads: int,
-    done: Callable[[int], None],
-    prepared: Path | None = None,
-    strict: bool = True,
-) -> tuple[list[InputPhoto], dict[str, str]]:
-    """Decode every photo, and read its EXIF; errors and the second value are those of `read_each`.
-
-    `threads` photos are decoded at once; `done` is called with the number of photos that were read. With `prepared`,
-    that folder gets what pycolmap is to read: links to the photos, and copies of those that `is_copied` tells.
-    """
     with ThreadPoolExecutor(threads) as pool:  # decoding releases the GIL
         jobs = {name: pool.submit(_read_photo, folder, name, prepared) for name in names}
         try:
-            photos, skipped = read_each(folder, names, lambda name: jobs[name].result(), strict, done)
+            for count, (name, job) in enumerate(jobs.items(), start=1):
+                try:
+                    photos.append(job.result())
+                except ValueError as error:
+                    if strict or isinstance(error.__cause__, MemoryError):
+                        raise
+                    skipped[name] = str(error).removeprefix(f"{folder / name}: ")
+                done(count)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    return list(photos.values()), skipped
+    if skipped and len(photos) < MIN_PHOTOS:
+        name, reason = next(iter(skipped.items()))
+        there = f"{len(photos) or 'none'} of {len(names)}; {name}: {reason}"
+        raise ValueError(f"{folder}: expected at least {MIN_PHOTOS} photos that can be read, found {there}")
+    return photos, skipped
 
 
-def _read_photo(folder: Path, name: str, prepared: Path | None) -> InputPhoto:
-    path = folder / name
-    if prepared is not None and is_copied(path):
-        original = path
-        if path.suffix.lower() in CONVERTED:
-            name = PurePosixPath(name).with_suffix(".jpg").as_posix()
-        path = prepared / name
+def _read_photo(folder: Path, name: str, prepared: Path) -> InputPhoto:
+    original, converted = folder / name, Path(name).suffix.lower() in CONVERTED
+    name = PurePosixPath(name).with_suffix(".jpg").as_posix() if converted else name
+    path = prepared / name
+    if converted or is_turned(original):
         pixels = copy_upright(original, path)
     else:
-        pixels = read_image(path)
-        if prepared is not None:
-            link(path, prepared / name)
+        pixels = read_image(original)
+        link(original, path)
     height, width = pixels.shape[:2]
     del pixels  # before pycolmap reads it
     try:
         camera = pycolmap_module().infer_camera_from_image(str(path))
     except (ValueError, RuntimeError) as error:
-        raise ValueError(f"{path}: pycolmap cannot decode it; save it anew as JPEG or PNG, or remove it") from error
+        raise ValueError(f"{original}: pycolmap cannot decode it; save it anew as JPEG or PNG, or remove it") from error
     if (camera.width, camera.height) != (width, height):
-        raise ValueError(f"{path}: expected {width}x{height}, pycolmap reads {camera.width}x{camera.height}")
+        raise ValueError(f"{original}: expected {width}x{height}, pycolmap reads {camera.width}x{camera.height}")
     focal = camera.focal_length if camera.has_prior_focal_length else None
     return InputPhoto(name, (width, height), _device(path), focal)
 

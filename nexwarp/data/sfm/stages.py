@@ -21,8 +21,6 @@ from nexwarp.data.sfm.photos import (
     affordable_threads,
     camera_groups,
     camera_model,
-    is_copied,
-    read_each,
     read_photos,
 )
 from nexwarp.data.sfm.report import EXHAUSTIVE_UP_TO, EstimatedCamera, Overlaps, SfmOptions, SfmReport, advise, left_out
@@ -57,10 +55,11 @@ class Stages:
     decoders: int = 1  # threads that may each hold a photo
     views: dict[str, str] = field(default_factory=dict)  # name of a panorama's view -> name of the panorama
     known: set[int] = field(default_factory=set)  # ids of the views' cameras
-    readable: Path = field(init=False)  # folder that pycolmap reads: `photos`, or links and upright copies of them
 
-    def __post_init__(self) -> None:
-        self.readable = self.photos
+    @property
+    def readable(self) -> Path:
+        """Folder that pycolmap reads: links to the photos, and upright copies."""
+        return self.folder / "photos"
 
     @property
     def threads(self) -> int:
@@ -138,7 +137,7 @@ class Stages:
         folder = self.folder / "views"
         with self._stage("cutting panoramas", len(panoramas)) as done:
             origins = cut_panoramas(self.photos, names, panoramas, folder, done)
-        self.photos = self.readable = folder
+        self.photos = folder
         self.views = {view: name for view, name in origins.items() if view != name}
         return list(origins)
 
@@ -152,14 +151,9 @@ class Stages:
         return [pair for one, other in pairs for pair in product(members[one], members[other])]
 
     def _read(self, names: Sequence[str], done: Callable[[int], None]) -> tuple[list[InputPhoto], dict[str, str]]:
-        """Decode the photos, and prepare them for pycolmap if any is turned or converted."""
-        strict = self.options.strict
-        copied, damaged = read_each(self.photos, names, lambda name: is_copied(self.photos / name), strict)
-        self.decoders = affordable_threads(self.photos, list(copied), self.options)
-        prepared = self.folder / "photos" if any(copied.values()) else None
-        self.readable = prepared or self.photos
-        photos, more = read_photos(self.photos, list(copied), self.decoders, done, prepared, strict)
-        return photos, damaged | more
+        """Decode the photos, and prepare them for pycolmap."""
+        self.decoders = affordable_threads(self.photos, names, self.options)
+        return read_photos(self.photos, names, self.decoders, done, self.readable, self.options.strict)
 
     def _import(self, groups: Sequence[Sequence[InputPhoto]]) -> None:
         """Enter photos and cameras in the database, in a fixed order, since the mapper's result depends on it."""
