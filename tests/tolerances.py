@@ -21,13 +21,7 @@ WEB_PSNR = {"full": 50.0, "quantised": 40.0}  # least PSNR, dB, of the web page'
 
 
 def assert_close(
-    actual: torch.Tensor,
-    expected: torch.Tensor,
-    *,
-    kind: str,
-    name: str,
-    precision: torch.dtype | None = None,
-    allow_flips: float = 0.0,
+    actual: torch.Tensor, expected: torch.Tensor, *, kind: str, name: str, precision=None, allow_flips: float = 0.0
 ) -> None:
     """Fail unless `actual` is finite and within the table's tolerance of `expected`, of any dtype.
 

@@ -170,11 +170,10 @@ def test_cameras_come_back_exactly(tmp_path):
             assert now.viewmat.dtype == torch.float32
 
 
-ROWS = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 K = [[9.0, 0.0, 4.0], [0.0, 9.0, 3.0], [0.0, 0.0, 1.0]]
-CAMERA: dict[str, object] = {"viewmat": ROWS, "K": K, "width": 8, "height": 6}
+CAMERA: dict[str, object] = {"viewmat": EYE, "K": K, "width": 8, "height": 6}
 NEAR = CAMERA | {"near": 0.1}
-MATRICES = (ROWS[:3], "text", [[float("nan")] * 4] * 4, [[10**400]])
+MATRICES = (EYE[:3], "text", [[float("nan")] * 4] * 4, [[10**400]])
 
 
 @pytest.mark.parametrize(
@@ -183,7 +182,7 @@ MATRICES = (ROWS[:3], "text", [[float("nan")] * 4] * 4, [[10**400]])
         *("", "{", "[1, 2]", '{"train": [1]}', '{"train": {"a": 3}}'),
         json.dumps({"train": {"a": CAMERA}}),  # no near
         *(json.dumps({"train": {"a": NEAR | {"viewmat": matrix}}}) for matrix in MATRICES),
-        *(json.dumps({"train": {"a": NEAR | {name: ROWS}}}) for name in ("near", "K", "width")),
+        *(json.dumps({"train": {"a": NEAR | {name: EYE}}}) for name in ("near", "K", "width")),
         json.dumps({"train": {"a": NEAR | {"width": 0}}}),
         *(json.dumps({"train": {name: NEAR}}) for name in ("../a", "C:/a")),
         json.dumps({"validation": {"a": NEAR}}),

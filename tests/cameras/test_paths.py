@@ -50,12 +50,6 @@ def moved(each: Camera, motion: tuple[torch.Tensor, torch.Tensor, float]) -> Cam
     return Camera(viewmat, each.K, each.width, each.height, each.near)
 
 
-def assert_seen(each: Camera, target: torch.Tensor) -> None:
-    """A camera has a point in front of it, at its principal point."""
-    x, y, depth = INTRINSICS @ (each.viewmat[:3, :3] @ target + each.viewmat[:3, 3])
-    assert depth > 1.0 and (x / depth).item() == pytest.approx(33.0) and (y / depth).item() == pytest.approx(20.0)
-
-
 def test_focus_is_where_the_axes_meet() -> None:
     target = torch.tensor([0.3, -1.0, 2.0], dtype=torch.float64)
     cameras = [camera(target + 3 * torch.randn(3), target) for _ in range(5)]
@@ -66,7 +60,8 @@ def test_every_camera_looks_at_the_focus_upright() -> None:
     cameras = ring()
     up = up_direction(cameras)
     for each in ellipse(cameras, 30):
-        assert_seen(each, focus(cameras))
+        x, y, depth = INTRINSICS @ (each.viewmat[:3, :3] @ focus(cameras) + each.viewmat[:3, 3])
+        assert depth > 1.0 and (x / depth).item() == pytest.approx(33.0) and (y / depth).item() == pytest.approx(20.0)
         right, down = each.viewmat[0, :3], each.viewmat[1, :3]
         assert abs(right @ up) < 1e-12 and down @ up < 0
         rotation = each.viewmat[:3, :3]

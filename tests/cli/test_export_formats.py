@@ -65,6 +65,8 @@ def test_a_finished_run_becomes_gltf_usd_and_spz(finished, monkeypatch, capsys):
             patch.setattr("importlib.util.find_spec", lambda name: None)
             refused(capsys, ["export", str(finished), "--format", kind, "--device", "cpu"], package, "pip install")
         assert not (finished / "export" / name).exists()
+    (finished / "cameras.json").unlink()
+    refused(capsys, ["export", str(finished), "--format", "glb", "--device", "cpu"], "cameras.json", "--format glb")
 
 
 def test_gltf_of_an_object_holds_the_subject_alone(finished, monkeypatch):
@@ -152,11 +154,6 @@ def test_exports_tell_their_stages(kind, stages, finished, capsys):
     assert all(line.isprintable() for line in lines)
     for stage, total in stages.items():
         assert counts[stage] == [(done, total) for done in range(1, total + 1)]
-
-
-def test_a_run_without_cameras_has_no_gltf(finished, capsys):
-    (finished / "cameras.json").unlink()
-    refused(capsys, ["export", str(finished), "--format", "glb", "--device", "cpu"], "cameras.json", "--format glb")
 
 
 def baked_files(run: Path, path: str | None = None, finetune: bool = True) -> tuple[list[bytes], list[str]]:

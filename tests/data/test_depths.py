@@ -24,10 +24,6 @@ WIDTH, HEIGHT = 24, 18
 VALUES = np.array([[1.5, 0.0, 2.0], [0.25, 60.0, 7.125]], np.float32)  # exact in half precision
 
 
-def write_exr(path: Path, values: np.ndarray) -> None:
-    save_exr(path, {"depth": torch.from_numpy(np.ascontiguousarray(values, np.float32))})
-
-
 def write_colmap(path: Path, values: np.ndarray) -> None:
     height, width = values.shape
     path.write_bytes(f"{width}&{height}&1&".encode() + struct.pack(f"<{values.size}f", *values.flatten()))
@@ -39,7 +35,7 @@ def write_png(path: Path, values: np.ndarray) -> None:
 
 WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
     "a.png": write_png,
-    "a.exr": write_exr,
+    "a.exr": lambda path, values: save_exr(path, {"depth": torch.from_numpy(np.float32(values))}),
     "a.npy": np.save,
     "a.jpg.geometric.bin": write_colmap,
 }

@@ -52,11 +52,6 @@ def test_scales_against_brute_force(count):
     np.testing.assert_allclose(predecessor_scales(means), brute_force_scales(means), rtol=1e-9)
 
 
-def test_scales_are_positive():
-    assert predecessor_scales(np.zeros((1, 3))).item() > 0.0 and (predecessor_scales(np.zeros((10, 3))) > 0.0).all()
-    assert (predecessor_scales(np.concatenate([np.zeros((10, 3)), np.ones((1, 3))])) >= 1e-6 * 3**0.5 * 0.999).all()
-
-
 def test_points_keep_their_colors_and_follow_scaling():
     points = torch.from_numpy(cloud(400)).float()
     colors = torch.randint(0, 256, (400, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
@@ -76,6 +71,8 @@ def test_fewer_points_than_wanted():
     assert len(chosen.means) == 7
     single = initial_points(torch.ones(1, 3), torch.ones(1, 3), 5)
     assert single.means.tolist() == [[1.0, 1.0, 1.0]] and single.scales.item() > 0.0
+    assert (predecessor_scales(np.zeros((10, 3))) > 0.0).all()
+    assert (predecessor_scales(np.concatenate([np.zeros((10, 3)), np.ones((1, 3))])) >= 1e-6 * 3**0.5 * 0.999).all()
 
 
 def test_filter_drops_planted_outliers_and_little_else():

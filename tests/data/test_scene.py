@@ -25,18 +25,13 @@ def pose(index: int) -> np.ndarray:
     return np.concatenate([rotation, rotation @ (2.0 * forward)[:, None]], axis=1)
 
 
+PINHOLE = (40.0, 43.0, 25.5, 16.25)
+
+
 def make_scene(
-    path: Path,
-    *,
-    model: str = "PINHOLE",
-    params: tuple[float, ...] = (40.0, 43.0, 25.5, 16.25),
-    names: list[str] | None = None,
-    poses: list[np.ndarray] | None = None,
-    points: np.ndarray | None = None,
-    where: str = "sparse/0",
-    text: bool = False,
+    path: Path, *, model="PINHOLE", params=PINHOLE, names=None, poses=None, points=None, where="sparse/0", text=False
 ) -> Path:
-    """Write a COLMAP scene with random photos."""
+    """Write a COLMAP scene with random photos: of names, poses (3, 4) world to camera and points (P, 3)."""
     pycolmap = pycolmap_module()
     rng = np.random.default_rng(0)
     names = [f"{index:02d}.png" for index in range(10)] if names is None else names
@@ -81,8 +76,10 @@ def views_of(scene):
 
 
 def test_loads_what_was_written(tmp_path):
-    scene = load_scene(make_scene(tmp_path))
-    assert scene.path == tmp_path and scene.points.dtype == torch.float32 and scene.colors.dtype == torch.uint8
+    calls: list[tuple[int, int]] = []
+    scene = load_scene(make_scene(tmp_path), progress=lambda *call: calls.append(call))
+    assert calls == [(done, 10) for done in range(1, 11)] and scene.path == tmp_path
+    assert scene.points.dtype == torch.float32 and scene.colors.dtype == torch.uint8
     expected = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 3)).astype(np.float32)
     assert np.array_equal(scene.points.numpy(), expected)
     assert scene.track_lengths.tolist() == [2 + index % 4 for index in range(20)]

@@ -239,17 +239,13 @@ def stored(path: Path) -> tuple[np.ndarray, dict[int, Any]]:
         return np.asarray(image.convert("RGB")), {**exif, **exif.get_ifd(0x8769)}
 
 
-def save_turned(path: Path, image: np.ndarray, orientation: int, **options: Any) -> None:
-    exif = Image.Exif()
-    exif[274] = orientation
-    Image.fromarray(np.rot90(image, TURNED[orientation])).save(path, exif=exif, **options)
-
-
 def test_photos_turned_by_exif_give_the_cameras_of_upright_ones(made, arc, tmp_path):
     """Two of the photos are stored on their side, one upside down: scene and photos are those of upright files."""
     folder = write_photos(tmp_path / "photos", arc.images)
     for name, orientation in zip(("view 6.png", "view 8.png", "view 10.png"), TURNED, strict=True):
-        save_turned(folder / name, arc.images[name], orientation)
+        tags = Image.Exif()
+        tags[274] = orientation
+        Image.fromarray(np.rot90(arc.images[name], TURNED[orientation])).save(folder / name, exif=tags)
     assert stored(folder / "view 6.png")[0].shape == (WIDTH, HEIGHT, 3)
     process(folder, tmp_path / "scene", options=dataclasses.replace(PINHOLE, threads=1))
     scene = tmp_path / "scene"

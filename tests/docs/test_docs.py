@@ -292,15 +292,6 @@ def test_links():
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
-def main(arguments: list[str]) -> int:
-    """Write the pages that are made of the code."""
-    if arguments != ["--write"]:
-        print("usage: python -m tests.docs.test_docs --write", file=sys.stderr)
-        return 2
+if __name__ == "__main__" and sys.argv[1:] == ["--write"]:
     for name, made in MADE.items():
         (DOCS / name).write_text(made(), encoding="utf-8")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -16,6 +16,7 @@ from examples import read_model
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.train.recipe import setting_names
+from tests.cli.support import read
 from tests.docs.test_docs import DOCS, ROOT
 from tests.scene_writers import expose_photos, write_demo
 
@@ -51,10 +52,6 @@ def header_of(file: Path) -> tuple[dict[str, Any], dict[str, str]]:
     return tensors, tensors.pop("__metadata__", {})
 
 
-def parsed(file: Path) -> Any:
-    return json.loads(file.read_text())
-
-
 def flat(data: dict[str, Any], *parts: str) -> set[str]:
     """Keys, those of the named parts with a dot."""
     return {key for key in data if key not in parts} | {f"{part}.{key}" for part in parts for key in data[part]}
@@ -66,13 +63,13 @@ def test_files(run):
     assert {f.name + "/" * f.is_dir() for f in run.iterdir()} == listed - optional
     assert {f.name for f in (run / "checkpoint").iterdir()} == named(section("checkpoint/"))
     assert {f.name for f in (run / "renders").iterdir()} == {"test", "compare"}
-    config, cameras = parsed(run / "config.json"), parsed(run / "cameras.json")
+    config, cameras = read(run, "config.json"), read(run, "cameras.json")
     assert flat(config, "scene") == named(section("config.json"))
     assert flat(config["config"], "losses", "rates", "texture", "densify") == set(setting_names())
     assert set(cameras) == {"train", "test"}
     for camera in [*cameras["train"].values(), *cameras["test"].values()]:
         assert set(camera) == named(section("cameras.json"))
-    assert set(parsed(run / "metrics.json")) == named(section("metrics.json"))
+    assert set(read(run, "metrics.json")) == named(section("metrics.json"))
     for line in (run / "metrics.jsonl").read_text().splitlines():
         assert set(json.loads(line)) == named(section("metrics.jsonl"))
     groups = {name.split(".")[0] for name in header_of(run / "checkpoint" / "tensors.safetensors")[0]}
@@ -85,7 +82,7 @@ def test_tensors(run):
     assert set(metadata) == {"nexwarp"}
     meta = json.loads(metadata["nexwarp"])
     text, shape = section("model.safetensors"), meta["texture"]
-    sizes = {"N": tensors["surfels.means"]["shape"][0], "C - 1": 15, "V": len(parsed(run / "cameras.json")["train"])}
+    sizes = {"N": tensors["surfels.means"]["shape"][0], "C - 1": 15, "V": len(read(run, "cameras.json")["train"])}
     sizes |= {"L": shape["levels"], "T": shape["table_size"], "F": shape["features"]}
     expected = {}
     for name, dtype, dimensions in re.findall(r"^\| `([a-z0-9A-Z_.]+)` \| (F\d\d) \| ([^|]+) \|", text, re.M):
@@ -103,7 +100,7 @@ def test_tensors(run):
 
 def test_the_reader_draws_what_nexwarp_draws(run, tmp_path):
     """The program of examples/, executed: pixels of a test view, to rounding."""
-    cameras = parsed(run / "cameras.json")["test"]
+    cameras = read(run, "cameras.json")["test"]
     name = next(iter(cameras))
     camera = load_cameras(run / "cameras.json")["test"][name]
     model = nw.load(run)
@@ -172,7 +169,7 @@ def execute(run, tmp_path, monkeypatch) -> Callable[[str], list[dict[str, Any]]]
 
 def test_the_python_of_paper_and_migrating_runs(execute, run, capsys):
     execute("docs/paper.md")
-    metrics = parsed(run / "metrics.json")
+    metrics = read(run, "metrics.json")
     assert capsys.readouterr().out == f"{ {key: metrics[key] for key in ('psnr', 'ssim', 'megabytes', 'seconds')} }\n"
     (names,) = execute("docs/migrating.md")
     assert names["image"].shape == (200, 300, 3) and names["image"].max() > 0.1

@@ -11,7 +11,7 @@ from nexwarp.cameras.paths import look_at
 from nexwarp.errors import FormatError, RunError, SettingError
 from nexwarp.export import splats as splat_files
 from nexwarp.export.mesh import Mesh, _surface, _without_crumbs, extract_mesh, save_mesh
-from nexwarp.export.splats import Pieces, gaussians, save_splats_ply, save_surfels_ply, split_large
+from nexwarp.export.splats import gaussians, save_splats_ply, save_surfels_ply, split_large
 from nexwarp.io.pictures import to_uint8
 from nexwarp.ops.tsdf import DistanceField
 from nexwarp.run.evaluate import psnr
@@ -135,12 +135,6 @@ def test_gltf_holds_the_gaussians_of_the_ply(tmp_path: Path, degree: int) -> Non
 CAMERA = nw.Camera(torch.eye(4), intrinsics(50, 50, 32, 24).float(), 64, 48)
 
 
-def blended(pieces: Pieces, at: torch.Tensor) -> torch.Tensor:
-    """Alpha of Gaussians in one plane, at (P, 2) places."""
-    apart = (at[:, None] - pieces.offsets) / pieces.scales
-    return 1 - (1 - pieces.opacities * torch.exp(-0.5 * apart.square().sum(-1))).prod(1)
-
-
 @pytest.mark.parametrize("opacity", [0.03, 0.3, 0.8, 0.97, 1.0])
 @pytest.mark.parametrize("scales", [(0.5, 0.02), (0.6, 0.4), (3.0, 3.0)])
 def test_the_pieces_of_a_surfel_have_its_alpha(opacity: float, scales: tuple[float, float]) -> None:
@@ -151,7 +145,9 @@ def test_the_pieces_of_a_surfel_have_its_alpha(opacity: float, scales: tuple[flo
     assert (pieces.scales.amax(0) <= (0.25 if scales[0] < 1 else 0.5)).all()
     places = 3.5 * sizes * (2 * torch.rand(4000, 2, dtype=torch.float64) - 1)
     expected = min(opacity, 0.99) * torch.exp(-0.5 * (places / sizes).square().sum(1))
-    error = (blended(pieces, places) - expected).abs()
+    apart = (places[:, None] - pieces.offsets) / pieces.scales
+    blended = 1 - (1 - pieces.opacities * torch.exp(-0.5 * apart.square().sum(-1))).prod(1)
+    error = (blended - expected).abs()
     assert error.max() < 0.06 and error.mean() < 0.008, (error.max(), error.mean())
 
 

@@ -40,11 +40,6 @@ def colors_of(leaves: Leaves, degree: int) -> torch.Tensor:
     return ops.plain_colors((sh0, shN), means, position, degree)
 
 
-def gradients(leaves: Leaves, degree: int) -> Leaves:
-    colors = colors_of(leaves, degree)
-    return list(torch.autograd.grad(colors, leaves, signal(colors)))
-
-
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize(("stored", "degree"), DEGREES)
 def test_plain_colors_agree_with_the_reference(stored, degree, dtype, device):
@@ -66,7 +61,9 @@ def test_plain_colors_agree_with_the_reference(stored, degree, dtype, device):
 @pytest.mark.usefixtures("poisoned_memory")
 def test_coefficients_above_the_degree_have_zero_gradients(stored: int, degree: int, device: torch.device) -> None:
     """All others have some. Memory that no kernel wrote would show as NaN."""
-    grad_sh0, grad_shN, _, _ = gradients(make(300, stored, torch.float32, device), degree)
+    leaves = make(300, stored, torch.float32, device)
+    colors = colors_of(leaves, degree)
+    grad_sh0, grad_shN, _, _ = torch.autograd.grad(colors, leaves, signal(colors))
     used = (degree + 1) ** 2 - 1
     assert grad_shN[:, used:].eq(0).all() and grad_shN[:, :used].ne(0).any(dim=2).any(dim=0).all() and grad_sh0.any()
 

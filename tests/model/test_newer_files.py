@@ -19,6 +19,7 @@ from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
+from tests.data.inputs.support import edit
 from tests.model.test_bounds import tiny_camera, tiny_model
 from tests.model_file_support import refused, rewrite
 from tests.scenes import make_camera, random_scene
@@ -26,12 +27,6 @@ from tests.trainer_support import assert_same_state, small, trained
 
 ANYTHING = {"new": [1, {"a": None}], "x": "text", "": 0}
 WRONG_VERSIONS = (True, False, 1.0, "1", 0, -1, None, [1], 1.5)
-
-
-def change_json(file: Path, change: Callable[[Any], object]) -> None:
-    data = json.loads(file.read_bytes())
-    change(data)
-    file.write_text(json.dumps(data))
 
 
 def test_a_model_with_unknown_keys_and_tensors_loads_the_same(tmp_path: Path) -> None:
@@ -63,7 +58,7 @@ def test_a_run_with_unknown_keys_reads_the_same(tmp_path: Path) -> None:
         for part in (data, data["scene"], data["config"], *(data["config"][x] for x in ("losses", "texture"))):
             part |= ANYTHING
 
-    change_json(tmp_path / "config.json", extend)
+    edit(tmp_path, extend, "config.json")
     assert read_run(tmp_path) == record and record.config.seed == 3 and record.source.downscale == 2
     write_json(tmp_path / "metrics.json", {"psnr": 20.0, **ANYTHING})
     assert read_metrics(tmp_path)["psnr"] == 20.0
@@ -78,7 +73,7 @@ def test_cameras_with_unknown_keys_load_the_same(tmp_path: Path) -> None:
         data |= ANYTHING
 
     before = load_cameras(file)
-    change_json(file, extend)
+    edit(tmp_path, extend, "cameras.json")
     after = load_cameras(file)
     assert after.keys() == before.keys() and torch.equal(after["train"]["a"].viewmat, before["train"]["a"].viewmat)
 
@@ -106,12 +101,12 @@ def write_version(kind: str, folder: Path, version: object) -> tuple[Path, Calla
         return file, lambda: nw.load(file)
     if kind == "config":
         create_run(folder, RunRecord(SceneSource("demo"), nw.Config()))
-        change_json(folder / "config.json", lambda old: old.update(data))
+        edit(folder, lambda old: old.update(data), "config.json")
         return folder / "config.json", lambda: read_run(folder)
     if kind == "checkpoint":
         folder.mkdir()
         save_checkpoint(folder, {"x": torch.zeros(1)}, {})
-        change_json(folder / "checkpoint" / "state.json", lambda old: old.update(data))
+        edit(folder / "checkpoint", lambda old: old.update(data), "state.json")
         return folder / "checkpoint", lambda: load_checkpoint(folder)
     file = folder / f"{kind}.json"
     write_json(file, {"train": {}, "test": {}, **data})

@@ -10,14 +10,7 @@ from tests.tolerances import assert_close, assert_finite
 Shape = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
-def antialiased(
-    depths: torch.Tensor,
-    scales: torch.Tensor,
-    opacities: torch.Tensor,
-    gammas: torch.Tensor,
-    farthest: torch.Tensor,
-    focal: float,
-) -> tuple[torch.Tensor, ...]:
+def antialiased(depths, scales, opacities, gammas, farthest, focal):
     variance = FILTER * ((depths / focal).square() - farthest.square()).clamp_min(0)
     wide = (scales.square() + torch.where(depths > 0, variance, 0)[:, None]).sqrt()
     share = scales / wide

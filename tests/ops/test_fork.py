@@ -69,14 +69,10 @@ print("parent")
 """
 
 
-def run(script: str) -> str:
-    done = run_python("-c", script, timeout=3 * SECONDS)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout
-
-
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork") or not hasattr(signal, "alarm"), reason="no fork here")
 
 
 def test_a_forked_process_renders_as_its_parent():
-    assert run(PARENT + FORK + MULTIPROCESSING + AFTER).splitlines()[-3:] == ["child True", "child True", "parent"]
+    done = run_python("-c", PARENT + FORK + MULTIPROCESSING + AFTER, timeout=3 * SECONDS)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.splitlines()[-3:] == ["child True", "child True", "parent"]

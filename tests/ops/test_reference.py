@@ -19,10 +19,6 @@ def tensor(*values: float | tuple[float, ...]) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)
 
 
-def leaves(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    return tuple(value.detach().clone().requires_grad_() for value in tensors)
-
-
 def view_of(scene: Scene) -> View:
     """The intrinsics of `scene` as the reference takes them."""
     (fx, _, cx), (_, fy, cy), _ = scene["K"].tolist()
@@ -192,7 +188,8 @@ def test_gradients_of_the_whole_render(sh_degree: int, textured: bool) -> None:
     scene["K"] = intrinsics(5.0, 6.0, 1.7, 1.4)
     scene["sh"] = 0.3 * scene["sh"]
     field = make_field(sh_degree)
-    inputs = leaves(*(scene[key] for key in (*FLOATS, "sh", "viewmat")), field.grid, *field.mlp)
+    given = (*(scene[key] for key in (*FLOATS, "sh", "viewmat")), field.grid, *field.mlp)
+    inputs = tuple(value.detach().clone().requires_grad_() for value in given)
 
     def picture(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         texture = Texture(tensors[7], field.resolutions, tensors[8:]) if textured else None

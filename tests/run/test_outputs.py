@@ -184,16 +184,13 @@ def test_export_cameras(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert data["test_filenames"] == [f"images_2/{n}" for n in TEST]
 
 
-LENS = f"{room.WIDTH} {room.HEIGHT} {' '.join(map(str, room.PINHOLE))}"
-
-
 @pytest.mark.parametrize(
     ("camera", "model"),
     [
-        (f"PINHOLE {LENS}", "PINHOLE"),
-        (f"OPENCV {LENS} -0.1 0.02 0.001 0.002", "OPENCV"),
+        (f"PINHOLE {room.LENS}", "PINHOLE"),
+        (f"OPENCV {room.LENS} -0.1 0.02 0.001 0.002", "OPENCV"),
         (f"SIMPLE_RADIAL_FISHEYE {room.WIDTH} {room.HEIGHT} 40 31 24.5 0.02", "OPENCV_FISHEYE"),
-        (f"DIVISION {LENS} -0.1", None),
+        (f"DIVISION {room.LENS} -0.1", None),
     ],
 )
 def test_exported_cameras_are_those_of_the_photos_files(tmp_path: Path, camera: str, model: str | None) -> None:

@@ -37,10 +37,6 @@ TRAIN = ["--iterations", "24", "--max-surfels", "100", "--device", "cpu"]
 OFTEN_SAVED = [*TRAIN, "--checkpoint-every", "2"]
 
 
-def long_config(size: int, steps: int) -> Config:
-    return small(iterations=steps * size, max_surfels=200, densify=DensifyConfig(every=1000, start=1000))
-
-
 def short_config() -> Config:
     return small(iterations=24)
 
@@ -70,7 +66,8 @@ def test_ranks_train_one_model(scene: nw.Scene, tmp_path: Path, size: int, steps
             first.step()
         if ranks.first:
             safetensors.torch.save_file(gradients[0], tmp_path / "gradients.safetensors")
-        replica = ParallelTrainer(scene, long_config(size, steps), CPU, ranks)
+        seldom = DensifyConfig(every=1000, start=1000)
+        replica = ParallelTrainer(scene, small(iterations=steps * size, max_surfels=200, densify=seldom), CPU, ranks)
         seen: list[int] = []
         replica.run(lambda step: seen.append(step.iteration))
         # Straight to the end, and resumed in the middle.

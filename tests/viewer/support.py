@@ -15,6 +15,7 @@ from PIL import Image
 
 import nexwarp as nw
 from nexwarp.viewer import Viewer, ViewerOptions
+from nexwarp.viewer.session import Session
 from tests.export.web import support
 
 OPTIONS = nw.RenderOptions(background=(0.1, 0.2, 0.3))
@@ -117,3 +118,9 @@ def wait_for(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
+
+
+def session_of(viewer: Viewer) -> Session:
+    """The session of the client that came last."""
+    wait_for(lambda: bool(viewer.sessions))
+    return viewer.sessions[max(viewer.sessions)]

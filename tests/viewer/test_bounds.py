@@ -15,15 +15,9 @@ from nexwarp.viewer import viewer as viewer_module
 from nexwarp.viewer.modes import Picture, draw
 from nexwarp.viewer.pacing import BAND_PIXELS, FIRST_PIXELS, MOST_PIXELS, MOST_SIDE, Pace, limited
 from nexwarp.viewer.session import Session
-from tests.viewer.support import WATCHED, Client, ring, serving, shown, wait_for
+from tests.viewer.support import WATCHED, Client, ring, serving, session_of, shown, wait_for
 
 WINDOWS = [(1920, 1080), (8192, 8192), (8192, 1), (1, 8192), (1, 1), (8192, 100)]
-
-
-def session_of(viewer: Viewer) -> Session:
-    """The session of the client that came last."""
-    wait_for(lambda: bool(viewer.sessions))
-    return viewer.sessions[max(viewer.sessions)]
 
 
 @pytest.mark.parametrize("window", WINDOWS)

@@ -9,7 +9,7 @@ import torch
 import nexwarp as nw
 from nexwarp.viewer.session import MeasureEditor
 from nexwarp.viewer.world import LEAST_ALPHA, Viewpoint, camera_to_world, surface_point, vertical_fov
-from tests.viewer.support import OPTIONS, Client, serving, wait_for
+from tests.viewer.support import OPTIONS, Client, serving, session_of, wait_for
 
 
 def test_a_point_lies_on_the_surface_under_the_click(camera) -> None:
@@ -57,8 +57,7 @@ def test_two_clicks_are_measured_and_the_third_begins_anew(model) -> None:
     with serving(model, measured=describe) as viewer, Client(viewer) as client:
         client.look()
         switch = client.control("Measure")
-        wait_for(lambda: bool(viewer.sessions))
-        (session,) = viewer.sessions.values()
+        session = session_of(viewer)
         wait_for(lambda: session.viewpoint is not None and session.viewpoint.width == 96)
         view, editor = session.viewpoint, session.measure
         assert isinstance(editor, MeasureEditor) and view is not None

@@ -12,7 +12,7 @@ from nexwarp.viewer import session as session_module
 from nexwarp.viewer import world as world_module
 from nexwarp.viewer.pacing import SMALLEST, Pace, Share
 from nexwarp.viewer.world import Viewpoint, World, camera_to_world, clearest, frustum_size, vertical_fov
-from tests.viewer.support import Client, ring, serving, wait_for
+from tests.viewer.support import Client, ring, serving, session_of
 
 
 def test_the_share_of_time_is_kept_whatever_pictures_cost():
@@ -70,8 +70,7 @@ def test_a_path_is_played_and_kept_as_its_views_say(model, tmp_path, monkeypatch
     monkeypatch.setattr(session_module, "MOST_VIEWS", 3)
     with serving(model, save_path=lambda path: keep_camera_path(tmp_path, path)) as viewer, Client(viewer) as client:
         client.look()
-        wait_for(lambda: bool(viewer.sessions))
-        (session,) = viewer.sessions.values()
+        session = session_of(viewer)
         editor = session.path
         editor.keep()
         assert "not saved" in editor.note.content
@@ -103,8 +102,7 @@ def test_a_sphere_is_drawn_and_its_command_shown(model) -> None:
 
     with serving(model, crop_command=command) as viewer, Client(viewer) as client:
         client.look()
-        wait_for(lambda: bool(viewer.sessions))
-        (session,) = viewer.sessions.values()
+        session = session_of(viewer)
         editor, unit = session.crop, viewer.world.unit
         np.testing.assert_allclose(commands[-1][0], viewer.world.focus, atol=1e-6)
         assert not editor.ball.visible and editor.note.content == "`crop it`"

@@ -7,7 +7,7 @@ from nexwarp.errors import FormatError
 from nexwarp.run.folder import PHOTOS_FILE
 from nexwarp.run.photo_table import load_photo_table
 from nexwarp.viewer.world import camera_to_world
-from tests.viewer.support import Client, serving, wait_for
+from tests.viewer.support import Client, serving, session_of, wait_for
 
 HEADER = b"photo,split,psnr,sharpness\n"
 DAMAGED = [
@@ -61,8 +61,7 @@ def test_a_chosen_photo_is_gone_to_and_its_option_shown(model):
                     break
         assert list(listed) == ["12.00 dB train/3.png", f"13.00 dB {hostile}", "30.00 dB train/1.png"]
         assert "<code>--exclude 3.png</code>" in notes[-1] and "medians 13.00 dB, 0.5" in notes[-1]
-        wait_for(lambda: bool(viewer.sessions))
-        (session,) = viewer.sessions.values()
+        session = session_of(viewer)
         for wrong in ("none", 3, None):
             client.send("GuiUpdateMessage", uuid=photos, updates={"value": wrong})
         for label, option in ((listed[1], "--exclude &#x27;&lt;img src=x"), (listed[2], "--exclude 1.png")):

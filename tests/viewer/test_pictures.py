@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import nexwarp as nw
+from nexwarp.io.pictures import to_uint8
 from nexwarp.viewer.modes import BY_SLOT, MODES, TEXTURED, Picture, Settings, draw
 from nexwarp.viewer.world import Viewpoint, camera_to_world, vertical_fov
 from tests.scenes import make_surfels, make_texture, random_scene
@@ -19,17 +20,13 @@ def drawn(model: nw.Model, bands: Sequence[nw.Camera], settings: Settings) -> Pi
     return picture
 
 
-def eight_bit(x: torch.Tensor) -> np.ndarray:
-    return (x.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-
-
 @pytest.mark.parametrize("mode", ["image", "plain", "textured"])
 def test_colour_modes_are_the_buffers(model, camera, mode):
     with torch.no_grad():
         out = model.render(camera, max_hits=3, sh_degree=1)
     picture = drawn(model, [camera], Settings(mode, max_hits=3, sh_degree=1))
     assert picture.span is None
-    np.testing.assert_array_equal(picture.pixels, eight_bit(getattr(out, mode)))
+    np.testing.assert_array_equal(picture.pixels, to_uint8(getattr(out, mode)).numpy())
 
 
 @pytest.mark.parametrize("falloff", [None, (-0.2, -0.1, 0.3)])

@@ -10,7 +10,7 @@ from nexwarp.train.trainer import Trainer
 from nexwarp.viewer import Viewer
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.trainer_support import assert_same_state, small
-from tests.viewer.support import OPTIONS, WATCHED, Client, ring, wait_for
+from tests.viewer.support import OPTIONS, WATCHED, Client, ring, session_of
 
 
 def test_looking_changes_nothing_about_a_training(tiny_scene):
@@ -22,9 +22,8 @@ def test_looking_changes_nothing_about_a_training(tiny_scene):
     drawn: list[int] = []
     with Viewer(trainer.model, cameras, WATCHED) as viewer, Client(viewer) as client:
         client.look()
-        wait_for(lambda: len(viewer.sessions) == 1)
+        session = session_of(viewer)
         viewer.share.share = 0.9
-        (session,) = viewer.sessions.values()
 
         def observe(step: Any) -> None:
             def describe() -> str:

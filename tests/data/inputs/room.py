@@ -14,6 +14,7 @@ from PIL import Image
 SIZE = np.array([4.0, 3.0, 4.0])  # the origin is its centre; y points down
 WIDTH, HEIGHT = 64, 48
 PINHOLE = (40.0, 41.0, 31.0, 24.5)  # fx, fy, cx, cy
+LENS = f"{WIDTH} {HEIGHT} {' '.join(map(str, PINHOLE))}"
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 VIEWS = 6
 RIGHT = 1.0  # of 255: a scene that is read as it was written has an error of 0.3; a shift of one pixel, 5
@@ -73,12 +74,7 @@ def save_png(file: Path, photo: np.ndarray) -> None:
     Image.fromarray(photo).save(file)
 
 
-def write_photos(
-    folder: Path,
-    save: Callable[[Path, np.ndarray], None] = save_png,
-    suffix: str = "png",
-    rays: np.ndarray | None = None,
-) -> list[str]:
+def write_photos(folder: Path, save: Callable[..., None] = save_png, suffix: str = "png", rays=None) -> list[str]:
     """Write the photos of all poses into a folder and return their names."""
     folder.mkdir(parents=True)
     names = [f"{index}.{suffix}" for index in range(VIEWS)]
@@ -87,13 +83,7 @@ def write_photos(
     return names
 
 
-def write_colmap(
-    path: Path,
-    names: Sequence[str],
-    camera: str = f"PINHOLE {WIDTH} {HEIGHT} {' '.join(map(str, PINHOLE))}",
-    offset: Sequence[float] = (0.0, 0.0, 0.0),
-    points: np.ndarray | None = None,
-) -> Path:
+def write_colmap(path: Path, names: Sequence[str], camera=f"PINHOLE {LENS}", offset=(0, 0, 0), points=None) -> Path:
     """Write a COLMAP text model of the photos `names`, in sparse/0, with the room's centre at `offset`.
 
     `points` are of the room, without the offset; None takes 300.

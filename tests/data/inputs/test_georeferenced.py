@@ -62,12 +62,6 @@ def point_error(scene, world: np.ndarray) -> float:
     return float(np.abs(scene.points.double().numpy() + scene.origin.numpy() - world).max())
 
 
-def test_a_frame_of_its_own_is_announced(tmp_path):
-    names = room.write_photos(tmp_path / "images")
-    with pytest.warns(UserWarning, match=r"cameras and points are relative to \(5000\d\d.*, the scene's `origin`"):
-        load_scene(colmap(tmp_path, names))
-
-
 @pytest.mark.filterwarnings(ANNOUNCED)
 @pytest.mark.parametrize("write", [colmap, world_transforms, applied(SHIFTED), applied(TURNED)])
 def test_photos_and_points_keep_their_pixels(tmp_path, write):
@@ -81,15 +75,15 @@ def test_photos_and_points_keep_their_pixels(tmp_path, write):
     assert point_error(load_scene(tmp_path, points=str(tmp_path / "other.ply")), room.wall_points(50, 7) + UTM) < 1e-5
 
 
-@pytest.mark.filterwarnings(ANNOUNCED)
-def test_a_frame_of_its_own_changes_nothing_else(tmp_path):
+def test_a_frame_of_its_own_is_announced_and_changes_nothing_else(tmp_path):
     """The local scene has no offset; the same at UTM coordinates has the same cameras, scale and depths."""
     names = room.write_photos(tmp_path / "images")
     local = load_scene(room.write_colmap(tmp_path, names))
     assert not local.origin.any()
     (tmp_path / "utm").mkdir()
     (tmp_path / "images").rename(tmp_path / "utm" / "images")
-    utm = load_scene(colmap(tmp_path / "utm", names))
+    with pytest.warns(UserWarning, match=r"cameras and points are relative to \(5000\d\d.*, the scene's `origin`"):
+        utm = load_scene(colmap(tmp_path / "utm", names))
     assert utm.scale == pytest.approx(local.scale, rel=1e-6)
     shift = utm.origin - torch.from_numpy(UTM)
     for one, other in zip(views_of(local), views_of(utm), strict=True):

@@ -32,10 +32,6 @@ def floats(data: bytes) -> bytes:
     return re.sub(rb"(?m)(?<=[ ])(\d+)(?= )|^(\d+)(?= )", lambda m: b"%.18e" % float(m[0]), data)
 
 
-def stripped(data: bytes) -> bytes:
-    return b"".join(line for line in data.splitlines(True) if line.endswith(b".png\n") or line.startswith(b"#"))
-
-
 def windows(data: bytes) -> bytes:
     return b"\xef\xbb\xbf" + data.replace(b"\n", b" \t\r\n")
 
@@ -65,12 +61,8 @@ def other_unicode_form(path: Path) -> Path:
     return path
 
 
-def absolute_names(path: Path) -> Path:
-    return make_scene(path, names=[str(path / f"images/{index:02d}.png") for index in range(10)])
-
-
 MODELS = {
-    "no lines of keypoints": edited("images", stripped),
+    "no lines of keypoints": edited("images", lambda data: re.sub(rb"(?m)^(?!#).*(?<!\.png)\n", b"", data)),
     "blank lines of keypoints": edited("images", lambda data: KEYPOINTS.sub(b"\n", data)),
     "blank lines everywhere": edited("images", lambda data: data.replace(b"\n", b"\n\n")),
     "comments between": edited("images", lambda data: data.replace(b".png\n", b".png\n # keypoints\n")),
@@ -83,7 +75,7 @@ MODELS = {
     "the larger model is not the first": larger_model_second,
     "names with backslashes": windows_names,
     "names in another Unicode form": other_unicode_form,
-    "absolute names": absolute_names,
+    "absolute names": lambda path: make_scene(path, names=[str(path / f"images/{i:02d}.png") for i in range(10)]),
     "text in sparse": lambda path: make_scene(path, where="sparse", text=True),
     "text in the scene's folder": lambda path: make_scene(path, where=".", text=True),
     "binary in the scene's folder": lambda path: make_scene(path, where="."),

@@ -35,9 +35,3 @@ def test_photos_that_do_not_fit_are_refused_before_they_are_read(tmp_path, monke
     sizes = [(3264, 2448)] * 1000
     assert nexwarp.data.scene.photos_bytes(sizes, 2, 3) < 0.9 * 7.2e9 < nexwarp.data.scene.photos_bytes(sizes, 1, 3)
     assert nexwarp.machine.available_memory() > 2**20
-
-
-def test_progress_counts_every_photo(tmp_path):
-    calls = []
-    load_scene(make_scene(tmp_path / "scene"), progress=lambda *call: calls.append(call))
-    assert calls == [(done, 10) for done in range(1, 11)]

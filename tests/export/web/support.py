@@ -178,6 +178,17 @@ def read_sections(content: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]
     return header, arrays
 
 
+def header_of(content: bytes) -> dict[str, Any]:
+    header: dict[str, Any] = json.loads(content[16 : 16 + struct.unpack("<I", content[12:16])[0]])
+    return header
+
+
+def rebuilt(content: bytes, **changes: Any) -> bytes:
+    """A file with another header."""
+    text = json.dumps({**header_of(content), **changes}).encode()
+    return content[:12] + struct.pack("<I", len(text)) + text + content[16 + struct.unpack("<I", content[12:16])[0] :]
+
+
 def read_surfels(content: bytes) -> dict[str, np.ndarray]:
     """The surfels of a scene file, float32."""
     header, arrays = read_sections(content)

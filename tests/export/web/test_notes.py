@@ -1,13 +1,12 @@
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import make_dataclass
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from PIL import Image
 
-import nexwarp as nw
 from nexwarp.errors import FormatError, MissingError, SettingError
 from nexwarp.export.web.export import INDEX, Note, Page, export_web, read_notes, static_files
 from nexwarp.export.web.scene_file import SCENE_FILE
@@ -17,6 +16,7 @@ from tests.export.web.support import CHROMIUM, FINISHED, PageTab, named_cameras,
 
 HOSTILE = '</script><img src=x onerror="nexwarp.hacked = 1">__TITLE__ <!-- & \u2028'
 FIRST = "nexwarp.notes.notes[0].button"
+Unbaked = make_dataclass("Unbaked", ["model"])  # takes the place of a baked scene
 
 
 class Metas(HTMLParser):
@@ -32,13 +32,6 @@ class Metas(HTMLParser):
         values = dict(attrs)
         if tag == "meta" and (name := values.get("property") or values.get("name")):
             self.found[name] = values.get("content") or ""
-
-
-@dataclass(frozen=True)
-class Unbaked:
-    """Takes the place of a baked scene."""
-
-    model: nw.Model
 
 
 @pytest.mark.parametrize("out", ["page", "page.html"])

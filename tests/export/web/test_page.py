@@ -1,10 +1,7 @@
 import html
-import json
 import re
-import struct
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -276,7 +273,7 @@ def test_the_subject_fits_from_side_to_side(open_tab, site, size):
     height; no window shows less than the photo's height."""
     tab = open_tab(*size)
     good = site[BAKED_FILE]
-    header = header_of(good)
+    header = support.header_of(good)
     wide = [{**camera, "width": 2 * camera["width"]} for camera in header["cameras"]]
     for camera in wide:
         camera["K"] = [*camera["K"][:2], 2 * camera["K"][2], camera["K"][3]]
@@ -284,7 +281,7 @@ def test_the_subject_fits_from_side_to_side(open_tab, site, size):
     across, along = photo["width"] / 2 / photo["K"][0], photo["height"] / 2 / photo["K"][1]
     depth = np.array(photo["viewmat"]).reshape(4, 4)[2] @ [*header["center"], 1.0]
     for subject in (along / 2, along * 1.1, across * 2):
-        tab.files = {**site, BAKED_FILE: rebuilt(good, cameras=wide, radius=depth * subject)}
+        tab.files = {**site, BAKED_FILE: support.rebuilt(good, cameras=wide, radius=depth * subject)}
         tab.open("?renderer=baked")
         pose = "nexwarp.pose.camera(nexwarp.canvas.width, nexwarp.canvas.height, 1)"
         width, height, fx, fy = tab.value(f"(c => [c.width, c.height, c.K[0], c.K[1]])({pose})")
@@ -295,24 +292,13 @@ def test_the_subject_fits_from_side_to_side(open_tab, site, size):
     assert not tab.errors
 
 
-def header_of(content: bytes) -> dict[str, Any]:
-    header: dict[str, Any] = json.loads(content[16 : 16 + struct.unpack("<I", content[12:16])[0]])
-    return header
-
-
-def rebuilt(content: bytes, **changes: Any) -> bytes:
-    """A baked scene with another header."""
-    text = json.dumps({**header_of(content), **changes}).encode()
-    return content[:12] + struct.pack("<I", len(text)) + text + content[16 + struct.unpack("<I", content[12:16])[0] :]
-
-
 def inflated(content: bytes) -> bytes:
     """A baked scene whose sections promise 2^24 surfels of deflated zeros, 3 GB."""
-    header = header_of(content)
+    header = support.header_of(content)
     for section in header["sections"]:
         section["shape"] = [2**24 if n == header["surfels"] else n for n in section["shape"]]
         section["encoding"] = "deflate"
-    return rebuilt(content, surfels=2**24, sections=header["sections"])
+    return support.rebuilt(content, surfels=2**24, sections=header["sections"])
 
 
 def test_damaged_files_give_one_line(tab, site):
@@ -322,10 +308,10 @@ def test_damaged_files_give_one_line(tab, site):
     for file, content, words in (
         (BAKED_FILE, good[:50], "the file ends before"),
         (BAKED_FILE, b"GIF89a" + good[6:], "expected NXWBAKED at the start"),
-        (BAKED_FILE, rebuilt(good, surfels=41), "expected the sections that the header describes"),
-        (BAKED_FILE, rebuilt(good, atlas=picture), "atlas: expected a picture's file"),
-        (BAKED_FILE, rebuilt(good, radius=0), "radius: expected a number above 0"),
-        (BAKED_FILE, rebuilt(good, sh_ranges=[1]), "sh_ranges: expected three numbers"),
+        (BAKED_FILE, support.rebuilt(good, surfels=41), "expected the sections that the header describes"),
+        (BAKED_FILE, support.rebuilt(good, atlas=picture), "atlas: expected a picture's file"),
+        (BAKED_FILE, support.rebuilt(good, radius=0), "radius: expected a number above 0"),
+        (BAKED_FILE, support.rebuilt(good, sh_ranges=[1]), "sh_ranges: expected three numbers"),
         (ATLAS_FILE, b"no picture", "expected a picture"),
         (BAKED_FILE, inflated(good), "expected sections that unpack to at most 134"),
         (BAKED_FILE, None, "WebGPU"),  # there is no baked scene: what is missing is WebGPU

@@ -3,7 +3,7 @@ import json
 import re
 import struct
 import zlib
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -124,11 +124,7 @@ def damaged() -> dict[str, bytes]:
     """Files that the page must refuse, by what is wrong with them."""
     content = content_of()
     length = struct.unpack_from("<I", content, 12)[0]
-    header = json.loads(content[16 : 16 + length])
-
-    def changed(**values: object) -> bytes:
-        text = json.dumps({**header, **values}).encode()
-        return content[:12] + struct.pack("<I", len(text)) + text + content[16 + length :]
+    header, changed = support.header_of(content), partial(support.rebuilt, content)
 
     def entry(name: str, **values: object) -> bytes:
         return changed(sections=[{**e, **values} if e["name"] == name else e for e in header["sections"]])
