@@ -170,6 +170,7 @@ def test_cameras_come_back_exactly(tmp_path):
             assert now.viewmat.dtype == torch.float32
 
 
+EYE = torch.eye(4).tolist()
 K = [[9.0, 0.0, 4.0], [0.0, 9.0, 3.0], [0.0, 0.0, 1.0]]
 CAMERA: dict[str, object] = {"viewmat": EYE, "K": K, "width": 8, "height": 6}
 NEAR = CAMERA | {"near": 0.1}
