@@ -120,14 +120,7 @@ def view_of(camera: nw.Camera, order: str = "depth") -> View:
 
 
 def reference_render(
-    surfels: nw.Surfels,
-    texture: nw.NeuralTexture | None,
-    camera: nw.Camera,
-    *,
-    order: str = "depth",
-    clamp_texture: bool = False,
-    shares: torch.Tensor | None = None,
-    **options: Any,
+    surfels: nw.Surfels, texture, camera: nw.Camera, *, order="depth", clamp_texture=False, shares=None, **options: Any
 ) -> reference.Rendering:
     """Hand the public objects, in float64 on the CPU, to the reference."""
     field = None

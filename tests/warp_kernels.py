@@ -10,21 +10,13 @@ from nexwarp.native.fixed_point import fixed_point_add
 
 REAL = wp.float64
 FLOAT32 = types(wp.float32)
+INTS, FLOATS = wp.array(dtype=wp.int32), wp.array(dtype=wp.float32)
 # Of the camera of `visit_blocks`.
 FOCAL, WIDTH, HEIGHT, NEAR = 60.0, 80, 56, 0.01
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def scaled_sum(
-    first: wp.int32,
-    a: wp.array(dtype=wp.float32),
-    b: wp.array(dtype=wp.float32),
-    shift: wp.vec2i,
-    scale: wp.float32,
-    negate: wp.bool,
-    # outputs
-    out: wp.array(dtype=wp.float32),
-):
+def scaled_sum(first: wp.int32, a: FLOATS, b: FLOATS, shift: wp.vec2i, scale: wp.float32, negate: wp.bool, out: FLOATS):
     """out = +-(scale * a + b + shift[0] + 10 shift[1]), without b where it is a null array."""
     i = first + wp.tid()
     x = scale * a[i] + float(shift[0] + 10 * shift[1])
@@ -34,12 +26,7 @@ def scaled_sum(
 
 
 @wp.kernel(module="unique", enable_backward=False)
-def add_in_order(
-    order: wp.array(dtype=wp.int32),
-    terms: wp.array(dtype=wp.float32),
-    sums: wp.array2d(dtype=wp.int64),
-    bad: wp.array(dtype=wp.int32),
-):
+def add_in_order(order: INTS, terms: FLOATS, sums: wp.array2d(dtype=wp.int64), bad: INTS):
     fixed_point_add(sums, 0, terms[order[wp.tid()]], bad)
 
 

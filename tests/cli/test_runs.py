@@ -43,18 +43,6 @@ def test_a_run_holds_what_it_should(trained, scene):
     assert not stray
 
 
-def test_training_says_what_it_does(scene, tmp_path, capsys):
-    run = tmp_path / "run"
-    assert cli.main(["train", str(scene), "--run", str(run), *FLAGS, "--max-hits", "0", "--seed", "3"]) == 0
-    out, err = capsys.readouterr()
-    assert err == ""
-    for word in ("tiny on the CPU, preset default", "8 training and 2 test views of 48x36", "iteration 20/20"):
-        assert word in out, word
-    assert f"next: nexwarp view {run} " in out.splitlines()[-1]
-    settings = config_from_dict(read(run, "config.json")["config"])
-    assert (settings.max_hits, settings.seed) == (0, 3) and nw.load(run).options.max_hits == 0
-
-
 def test_memory_that_ends_while_finishing_costs_no_training(scene, tmp_path, monkeypatch, capsys):
     def full(*_: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. And more")

@@ -89,10 +89,7 @@ BAD = {
     "x twice": (ply(vertex(1, "float x", *XYZ), ONE + ONE), "properties of different names"),
     "truncated": (ply(vertex(2, *XYZ), ONE + ONE[:-1]), "truncated, expected 2 of element vertex, got 23 bytes"),
     "ascii beyond the end": (ply(vertex(10**17, *XYZ), b"1 2 3\n", "ascii"), "truncated, expected 100,000,000,000,000"),
-    "ascii too short": (
-        ply(vertex(3, *XYZ), b"1 2 3\n1.23456 2 3\n1.2345 2\n", "ascii"),
-        "expected rows of 3 numbers",
-    ),
+    "ascii too short": (ply(vertex(3, *XYZ), b"1 2 3\n1.23456 2 3\n1.2345 2\n", "ascii"), "expected rows of 3 numbers"),
     "ascii of words": (ply(vertex(1, *XYZ), b"one two three\n", "ascii"), "expected rows of 3 numbers"),
     "ascii of four": (ply(vertex(1, *XYZ), b"1 2 3 4\n", "ascii"), r"got \(1, 4\)"),
     "lists": (ply("element vertex 1\nproperty list uchar float x\n", ONE), "without lists first, got its lists"),

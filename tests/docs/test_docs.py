@@ -36,26 +36,10 @@ CODE = dict.fromkeys(("background", "seed"), ("", "code"))
 SYMBOLS = {"iterations": ("", "4.3"), "max_surfels": ("P", "4.3"), "max_hits": ("K", "5"), **CODE}
 SYMBOLS |= {"sh_degree": ("S = (d + 1)^2", "5"), "texture.table_size": ("T", "5")}
 
-SETTINGS = """\
-# Settings
 
-What a person chooses of a training, `nexwarp.Config`; the options of all commands are in [Commands](cli.md). `--preset`
-picks the values to start from, the flags of `nexwarp train` change some, and `--set KEY=VALUE`, repeated, any:
-
-    nexwarp train SCENE --preset paper --set texture.table_size=65536
-    nexwarp train SCENE --set mask_mode=background --set losses.depth=0.1 --set 'background=[0, 0, 0]'
-
-VALUE is JSON (`1024`, `true`, `null`, `[0.001, 0.00001]`) or a bare word. An unknown KEY and a value of another type or
-out of range are refused before anything is written. The settings of a run are in its `config.json`. With `--resume`
-they come from there, and options that are given must agree with them.
-
-All others, such as learning rates and the texture's shape, are documented in
-[recipe.py](https://github.com/nexwarp/nexwarp/blob/main/nexwarp/train/recipe.py), with the values of the presets and
-of `demo`; `--set` reaches them, too.
-
-Symbol and section are the publication's; "code" means that only the authors' code has the setting. Values that differ
-are bold. [Presets and paper](paper.md) says why. `python -m tests.docs.test_docs --write` makes this page of the code.
-"""
+def written_above(page: str, made: str) -> str:
+    """The text that a person wrote, above the part that is made."""
+    return (DOCS / page).read_text(encoding="utf-8").partition(f"\n{made}")[0]
 
 
 # docs/options.md
@@ -81,7 +65,8 @@ def cell(text: Any) -> str:
 
 
 def options_page() -> str:
-    page = [SETTINGS, "| KEY | default | `paper` | what | symbol | section |\n|---|---|---|---|---|---|"]
+    table = "| KEY | default | `paper` | what | symbol | section |\n|---|---|---|---|---|---|"
+    page = [written_above("options.md", table), table]
     ours, paper = preset("default"), preset("paper")
     for name in USER_SETTINGS:
         part, _, key = name.rpartition(".")
@@ -96,13 +81,6 @@ def options_page() -> str:
 
 # docs/cli.md
 
-COMMANDS_PAGE = """\
-# Commands
-
-What `nexwarp COMMAND --help` prints. The page is made from the code by `python -m tests.docs.test_docs --write`; a test
-fails if the two disagree. [Settings](options.md) has the keys of `--set`. Bad input gives one line on stderr and exit
-code 2. Ctrl-C exits with 130.
-"""
 ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -116,7 +94,7 @@ def help_text(*command: str, width: int = 100) -> str:
 
 
 def commands_page() -> str:
-    page = [COMMANDS_PAGE]
+    page = [written_above("cli.md", "## nexwarp")]
     for command in ([], *([name] for name in cli.COMMANDS)):
         page += [f"## {' '.join(['nexwarp', *command])}", "", "```text", help_text(*command), "```", ""]
     return "\n".join(page)
@@ -124,13 +102,6 @@ def commands_page() -> str:
 
 # docs/api.md
 
-API_PAGE = """\
-# Python API
-
-The public names of `nexwarp`, those of `nexwarp.__all__`; they are [stable](versioning.md). [Training from
-Python](python.md) shows how they go together. `python -m tests.docs.test_docs --write` makes this page of the
-docstrings, which `help(nw.render)` shows, too.
-"""
 # Titles, and the rooms of the package whose names stand below them.
 ROOMS = {"Models and rendering": ("model", "ops", "kernels", "export"), "Cameras": ("cameras",)}
 ROOMS |= {"Scenes": ("data", "io"), "Training": ("train", "run", "cli")}
@@ -211,7 +182,7 @@ def api_page() -> str:
                 table.append(f"| [`{name}`](#{name.lower()}) | {cell(doc.splitlines()[0])} |")
                 texts += [f"### {name}\n", *section_of(made, name)]
     assert len(table) - 2 == len(nw.__all__), "a public name of a room that no title has"
-    return "\n".join([API_PAGE, *table, "", *texts]).rstrip() + "\n"
+    return "\n".join([written_above("api.md", table[0]), *table, "", *texts]).rstrip() + "\n"
 
 
 MADE = {"options.md": options_page, "cli.md": commands_page, "api.md": api_page}

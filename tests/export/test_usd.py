@@ -23,30 +23,31 @@ pytest.importorskip("pxr", reason="usd-core (extra `usd`)")
 
 
 @pytest.fixture
-def model():
-    return make_model()
+def made():
+    """A model, cameras around it, and its cards."""
+    model, views = make_model(), list(ring().values())
+    return model, views, make_cards(bake(model, views, steps=1))
 
 
-@pytest.fixture
-def views():
-    return list(ring().values())
+def opened(file):
+    """The stage of a file, in which no validator finds an error."""
+    from pxr import Usd, UsdValidation
 
-
-@pytest.fixture
-def cards(model, views):
-    return make_cards(bake(model, views, steps=1))
-
-
-def test_a_stage_has_the_cards_and_the_surfels(model, cards, views, tmp_path):
-    from pxr import Usd, UsdGeom, UsdShade, UsdValidation
-
-    file = tmp_path / "new" / "scene.usdz"
-    save_usdz(file, cards, model.surfels, 1, views)
-    assert [path.name for path in file.parent.iterdir()] == ["scene.usdz"]
     stage = Usd.Stage.Open(str(file))
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert validators
     assert not [error.GetMessage() for error in UsdValidation.ValidationContext(validators).Validate(stage)]
+    return stage
+
+
+def test_a_stage_has_the_cards_and_the_surfels(made, tmp_path):
+    from pxr import Usd, UsdGeom, UsdShade
+
+    model, views, cards = made
+    file = tmp_path / "new" / "scene.usdz"
+    save_usdz(file, cards, model.surfels, 1, views)
+    assert [path.name for path in file.parent.iterdir()] == ["scene.usdz"]
+    stage = opened(file)
     assert UsdGeom.GetStageUpAxis(stage) == "Y" and stage.GetDefaultPrim().GetPath() == "/Scene"
 
     mesh, corners = UsdGeom.Mesh(stage.GetPrimAtPath("/Scene/Cards")), quads(cards)[0]
@@ -91,14 +92,13 @@ def test_a_stage_has_the_cards_and_the_surfels(model, cards, views, tmp_path):
         assert [name for name, is_visible in visible.items() if not is_visible] == [hidden]
 
 
-def test_a_collision_mesh_is_there_for_physics_and_not_drawn(model, cards, views, tmp_path):
-    from pxr import Usd, UsdGeom, UsdValidation
+def test_a_collision_mesh_is_there_for_physics_and_not_drawn(made, tmp_path):
+    from pxr import UsdGeom
 
+    model, views, cards = made
     points, faces = np.eye(4, 3, dtype=np.float32), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32)
     save_usdz(tmp_path / "scene.usdz", cards, model.surfels, 1, views, Mesh(points, points, points, faces))
-    stage = Usd.Stage.Open(str(tmp_path / "scene.usdz"))
-    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    assert not [error.GetMessage() for error in UsdValidation.ValidationContext(validators).Validate(stage)]
+    stage = opened(tmp_path / "scene.usdz")
     mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Scene/Collision"))
     assert mesh.ComputePurpose() == "guide"
     assert mesh.GetPrim().GetAppliedSchemas() == ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"]
@@ -107,7 +107,8 @@ def test_a_collision_mesh_is_there_for_physics_and_not_drawn(model, cards, views
     assert list(mesh.GetFaceVertexCountsAttr().Get()) == [3] * 4
 
 
-def test_without_cards_there_is_no_file(model, views, tmp_path):
+def test_without_cards_there_is_no_file(made, tmp_path):
+    model, views, _ = made
     with torch.no_grad():
         model.surfels.logit_opacities.fill_(-9.0)
     with pytest.raises(FormatError, match="expected surfels that are opaque enough"):

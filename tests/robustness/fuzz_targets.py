@@ -342,12 +342,7 @@ TARGETS = {
         FuzzTarget("camera_path", _camera_path, _read_camera_path, (".json",)),
         FuzzTarget("ply", _ply, lambda folder: read_ply(folder / "points.ply"), (".ply",)),
         FuzzTarget("masks", _images, _read_images, ("mask",)),
-        FuzzTarget(
-            "photos",
-            _photo_files,
-            _read_photos,
-            (".jpg",),
-        ),
+        FuzzTarget("photos", _photo_files, _read_photos, (".jpg",)),
         FuzzTarget("baked", _baked, _read_baked, (".nxb", ".glb")),
         FuzzTarget("depths", _depths, _read_depths, (".png", ".npy", ".exr", ".bin")),
         FuzzTarget("linear", _linear, _read_linear, (".exr", ".png")),

@@ -26,8 +26,8 @@ SETTINGS: dict[str, Any] = {
 }
 
 
-def trained(scene: nw.Scene, **changes: Any) -> nw.Trainer:
-    trainer = nw.Trainer(scene, Config(**(SETTINGS | changes)), "cuda")
+def trained(scene: nw.Scene, losses: Any = None, **changes: Any) -> nw.Trainer:
+    trainer = nw.Trainer(scene, Config(**(SETTINGS | changes)), "cuda", losses=losses)
     trainer.run()
     return trainer
 
@@ -63,6 +63,15 @@ def test_graphs_give_the_bits_of_launches(tiny_scene: nw.Scene, changes: dict[st
     launched = trained(tiny_scene, cuda_graphs=False, **changes)
     replayed = trained(tiny_scene, **changes)
     assert launched.graphs is None and graphs_of(replayed) > 0
+    assert_same_state(replayed, launched)
+
+
+def test_own_losses_are_captured(tiny_scene: nw.Scene) -> None:
+    def loss(rendering: nw.Rendering, target: nw.Target) -> torch.Tensor:
+        return 0.1 * (rendering.image - target.photo).square().mean()
+
+    launched, replayed = (trained(tiny_scene, {"own": loss}, cuda_graphs=graphs) for graphs in (False, True))
+    assert graphs_of(replayed) > 0
     assert_same_state(replayed, launched)
 
 

@@ -64,30 +64,6 @@ def test_losses_that_do_not_fit_are_named(scene, losses, error, match):
         run(scene, 1, losses=losses)
 
 
-@pytest.mark.cuda
-def test_own_losses_are_captured(scene: Scene) -> None:
-
-    def loss(rendering: nw.Rendering, target: nw.Target) -> torch.Tensor:
-        return 0.1 * (rendering.image - target.photo).square().mean()
-
-    runs = []
-    # At any one step there may be no graph: where lists turn out too short, the next step drops it.
-    replayed: list[bool] = []
-
-    def observe(_: nw.StepReport) -> None:
-        if trainer.graphs is not None:
-            replayed.extend(stage.captured is not None for stage in trainer.graphs.stages.values())
-
-    for graphs in (False, True):
-        config = dataclasses.replace(SMALL, iterations=120, deterministic=True, cuda_graphs=graphs)
-        trainer = nw.Trainer(scene, config, "cuda", losses={"own": loss})
-        trainer.run(observe)
-        runs.append(trainer)
-    assert any(replayed)
-    for (name, value), (_, other) in zip(runs[0]._named_parameters(), runs[1]._named_parameters(), strict=True):
-        assert torch.equal(value, other), name
-
-
 def parts(scene: Scene) -> dict[str, Any]:
     views = sorted(scene.train + scene.test, key=lambda view: view.name)
     images, cameras, names = ([getattr(view, name) for view in views] for name in ("image", "camera", "name"))

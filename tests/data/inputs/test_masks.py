@@ -74,16 +74,12 @@ KINDS = {
 }
 
 
-def written(file, write, mask) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write(file, mask)
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_masks_of_every_kind(tmp_path, kind):
     path = make_scene(tmp_path / "scene", names=["0.png", "1.png"])
-    written(path / "masks" / "0.png", KINDS[kind], MASK)
-    written(path / "masks" / "1.tif.png", KINDS["0 and 1"], MASK)  # of no photo
+    (path / "masks").mkdir()
+    KINDS[kind](path / "masks" / "0.png", MASK)
+    KINDS["0 and 1"](path / "masks" / "1.tif.png", MASK)  # of no photo
     mask = views_of(load_scene(path))[0].mask
     assert mask is not None and np.array_equal(mask.numpy(), MASK)
 

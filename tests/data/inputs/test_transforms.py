@@ -56,10 +56,6 @@ def test_intrinsics_of_frames_and_files(tmp_path, kind):
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx(pinhole, rel=1e-6)
 
 
-def absolute(path: Path) -> Path:
-    return write(path, names=[str(path / f"images/{index}.png") for index in range(room.VIEWS)])
-
-
 def bare(path: Path) -> Path:
     """As ScanNet++ names photos, and holds some out."""
     names = [f"{index}.png" for index in range(room.VIEWS)]
@@ -70,7 +66,7 @@ def bare(path: Path) -> Path:
 
 
 WRITERS = {
-    "absolute paths": absolute,
+    "absolute paths": lambda path: write(path, names=[str(path / f"images/{i}.png") for i in range(room.VIEWS)]),
     "bare names and test_frames": bare,
     "backslashes": lambda path: write(path, names=[rf".\images\a\{index}.png" for index in range(room.VIEWS)]),
     "another Unicode form": lambda path: write(

@@ -24,10 +24,7 @@ DRAW = """async camera => {
 }"""
 TARGET = "(p => p.eye.map((x, i) => x + p.distance * p.axes().forward[i]))(nexwarp.pose)"
 
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"),
-    pytest.mark.timeout(300),
-]
+pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"), pytest.mark.timeout(300)]
 
 
 def test_the_baked_scene_in_the_page_is_the_one_of_python(tab, site, model, cameras, tmp_path):

@@ -11,10 +11,7 @@ from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE
 from tests.export.web import support
 from tests.export.web.support import CHROMIUM, FINISHED, POSE, PageTab, psnr
 
-pytestmark = [
-    pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"),
-    pytest.mark.timeout(300),
-]
+pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine"), pytest.mark.timeout(300)]
 SIZE = (96, 80)  # of an eye, pixels
 HEADSET = """kinds => {
     const session = Object.assign(new EventTarget(), {
