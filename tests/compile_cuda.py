@@ -68,6 +68,8 @@ def kernels(choice: str) -> Iterator[wp.Kernel]:
                 continue
             if isinstance(member, wp.Kernel):
                 yield member
+            elif hasattr(member, "is_kernel"):
+                yield member(wp.float32)
             elif name.endswith(("_kernel", "_kernels")):
                 yield from made_by(member, values)
 

@@ -3,12 +3,11 @@
 The backward kernel writes what `wp.grad` gives for the product of outputs and their gradients; nothing is added up.
 """
 
-import functools
-from types import SimpleNamespace
+from __future__ import annotations
 
 import warp as wp
 
-from nexwarp.kernels.types import Real, Vec2, Vec4, types
+from nexwarp.kernels.types import Real, Vec2, Vec4, per_real
 
 # Quaternions shorter than this are divided by it: torch.nn.functional.normalize's.
 SHORTEST = wp.constant(wp.float64(1e-12))
@@ -63,36 +62,29 @@ def unit_dot(quat: Vec4, grad: Vec4):
     return wp.dot(unit(quat), grad)
 
 
-@functools.cache
-def activate_kernels(real: type) -> SimpleNamespace:
-    """Make the kernels of quaternion / length, exp, sigmoid and 1 + exp."""
-    t = types(real)
-    vec2, ONE, Parameters = t.vec2, t.ONE, t.Parameters
+@per_real()
+def activate(first: int, raw: Parameters, activated: Parameters):
+    i = first + wp.tid()
+    activated.quats[i] = unit(raw.quats[i])
+    activated.scales[i] = exponentials(raw.scales[i])
+    activated.opacities[i] = sigmoid(raw.opacities[i])
+    activated.gammas[i] = vec2(ONE, ONE) + exponentials(raw.gammas[i])
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def activate(first: wp.int32, raw: Parameters, activated: Parameters):
-        i = first + wp.tid()
-        activated.quats[i] = unit(raw.quats[i])
-        activated.scales[i] = exponentials(raw.scales[i])
-        activated.opacities[i] = sigmoid(raw.opacities[i])
-        activated.gammas[i] = vec2(ONE, ONE) + exponentials(raw.gammas[i])
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def activate_backward(first: wp.int32, raw: Parameters, grads: Parameters, grad_raw: Parameters):
-        i = first + wp.tid()
-        quat, scale, opacity, gamma, _q, _s, _o, _g = wp.grad(activated_dot)(
-            raw.quats[i],
-            raw.scales[i],
-            raw.opacities[i],
-            raw.gammas[i],
-            grads.quats[i],
-            grads.scales[i],
-            grads.opacities[i],
-            grads.gammas[i],
-        )
-        grad_raw.quats[i] = quat
-        grad_raw.scales[i] = scale
-        grad_raw.opacities[i] = opacity
-        grad_raw.gammas[i] = gamma
-
-    return SimpleNamespace(forward=activate, backward=activate_backward)
+@per_real()
+def activate_backward(first: int, raw: Parameters, grads: Parameters, grad_raw: Parameters):
+    i = first + wp.tid()
+    quat, scale, opacity, gamma, _q, _s, _o, _g = wp.grad(activated_dot)(
+        raw.quats[i],
+        raw.scales[i],
+        raw.opacities[i],
+        raw.gammas[i],
+        grads.quats[i],
+        grads.scales[i],
+        grads.opacities[i],
+        grads.gammas[i],
+    )
+    grad_raw.quats[i] = quat
+    grad_raw.scales[i] = scale
+    grad_raw.opacities[i] = opacity
+    grad_raw.gammas[i] = gamma

@@ -136,7 +136,7 @@ def update(thread: wp.int32, adam: Adam) -> wp.float32:
 
 
 @wp.kernel(enable_backward=False, module="unique", launch_bounds=(256, 5))
-def adam_step(first: wp.int32, adam: Adam, losses: Real):
+def adam_step(first: int, adam: Adam, losses: Real):
     """Losses are those of the grid's warps."""
     thread = first + wp.tid()
     loss = update(thread, adam)

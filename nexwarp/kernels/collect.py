@@ -46,7 +46,7 @@ def hit_buffer(real: type, max_hits: int) -> SimpleNamespace:
         return ids, reals()
 
     @wp.func
-    def write(surfels: t.Surfels, hits: t.Hits, p: wp.int32, ids: integers, weights: reals, d: t.vec2):
+    def write(surfels: t.Surfels, hits: t.Hits, p: int, ids: integers, weights: reals, d: t.vec2):
         """Write the buffer of pixel p, whose ray is d; return the blended colour of its hits."""
         base = t.vec3()
         for j in range(wp.static(max_hits)):
@@ -71,7 +71,7 @@ def channel_functions(real: type, wide: bool) -> SimpleNamespace:
     mat44, Surfels, Hits = t.mat44, t.Surfels, t.Hits
 
     @wp.func
-    def load(rows: wp.array2d(dtype=t.vec4), i: wp.int32):
+    def load(rows: wp.array2d(dtype=t.vec4), i: int):
         """Row i of an array of channels."""
         result = mat44()
         if wp.static(wide):
@@ -80,19 +80,19 @@ def channel_functions(real: type, wide: bool) -> SimpleNamespace:
         return result
 
     @wp.func
-    def blend(surfels: Surfels, i: wp.int32, weight: real, total: mat44):
+    def blend(surfels: Surfels, i: int, weight: real, total: mat44):
         """Add weight times the channels of surfel i; i = -1 has the weight 0."""
         return total + load(surfels.channels, wp.max(i, 0)) * weight
 
     @wp.func
-    def store(hits: Hits, p: wp.int32, total: mat44):
+    def store(hits: Hits, p: int, total: mat44):
         """Write the channels of pixel p."""
         if wp.static(wide):
             for row in range(4):
                 hits.channels[p, row] = total[row]
 
     @wp.func
-    def product(rows: wp.array2d(dtype=t.vec4), i: wp.int32, grad: mat44):
+    def product(rows: wp.array2d(dtype=t.vec4), i: int, grad: mat44):
         """Inner product of row i and a gradient."""
         result = real(0.0)
         if wp.static(wide):
@@ -131,7 +131,7 @@ def collect_kernel(real: type, max_hits: int, wide: bool = False) -> wp.Kernel:
         module_options={"fast_math": real is wp.float32},
         launch_bounds=_launch_bounds(real, max_hits, wide),
     )
-    def collect(first: wp.int32, surfels: t.Surfels, lists: TileLists, view: t.View, hits: t.Hits):
+    def collect(first: int, surfels: t.Surfels, lists: TileLists, view: t.View, hits: t.Hits):
         thread = first + wp.tid()
         xy, inside, d = pixel_of(thread, view)
         middle, half = block_of(xy, view)

@@ -34,7 +34,7 @@ import warp as wp
 from nexwarp.kernels.collect import channel_functions, hit_buffer
 from nexwarp.kernels.shape import alpha_at, far_outside
 from nexwarp.kernels.surfel import hit, hit_gradients, record_gradients
-from nexwarp.kernels.types import TileLists, types
+from nexwarp.kernels.types import TileLists, ints, types
 from nexwarp.kernels.walk import block_of, overflowed, pixel_of, stage, tile_of, walk
 from nexwarp.native.fixed_point import fixed_point_add, fixed_point_record_sum
 from nexwarp.native.staging import BLOCK_DIM, staged_name, staged_record
@@ -54,23 +54,23 @@ def gradient_types(real: type, fixed_point: bool = False) -> SimpleNamespace:
     class HitGradients:
         """Gradients of the outputs of `collect`, and the error of each pixel."""
 
-        plain: wp.array(dtype=t.vec3)
-        base: wp.array(dtype=t.vec3)
-        depths: wp.array2d(dtype=real)
-        weights: wp.array2d(dtype=real)
-        alphas: wp.array(dtype=real)
-        errors: wp.array(dtype=real)
-        channels: wp.array2d(dtype=t.vec4)
+        plain: t.vec3s
+        base: t.vec3s
+        depths: t.real_rows
+        weights: t.real_rows
+        alphas: t.reals
+        errors: t.reals
+        channels: t.vec4_rows
 
     @wp.struct
     class Sums:
         """What is added up for each surfel or gradient slot, and the flag of a term that fixed point cannot hold."""
 
-        slots: wp.array(dtype=wp.int32)
-        records: pairs if fixed_point else wp.array2d(dtype=t.vec4)
-        errors: pairs if fixed_point else wp.array(dtype=real)
-        bad: wp.array(dtype=wp.int32)
-        channels: pairs if fixed_point else wp.array2d(dtype=t.vec4)
+        slots: ints
+        records: pairs if fixed_point else t.vec4_rows
+        errors: pairs if fixed_point else t.reals
+        bad: ints
+        channels: pairs if fixed_point else t.vec4_rows
 
     return SimpleNamespace(HitGradients=HitGradients, Sums=Sums)
 
@@ -82,7 +82,7 @@ def add_function(real: type, fixed_point: bool, by_place: bool) -> wp.Function:
     vec4, Sums = t.vec4, gradient_types(real, fixed_point).Sums
 
     @wp.func
-    def add(sums: Sums, i: wp.int32, k: wp.int32, a: vec4, b: vec4, n: vec4, c: vec4):
+    def add(sums: Sums, i: int, k: int, a: vec4, b: vec4, n: vec4, c: vec4):
         slot = int(i)
         if wp.static(by_place):
             slot = sums.slots[k]
@@ -101,7 +101,7 @@ def add_channels_function(real: type, fixed_point: bool, wide: bool) -> wp.Funct
     Sums = gradient_types(real, fixed_point).Sums
 
     @wp.func
-    def add_channels(sums: Sums, slot: wp.int32, grad: types(real).mat44):
+    def add_channels(sums: Sums, slot: int, grad: types(real).mat44):
         if wp.static(wide):
             if wp.static(fixed_point):
                 fixed_point_record_sum(sums.channels, slot, grad[0], grad[1], grad[2], grad[3], sums.bad)
@@ -117,7 +117,7 @@ def add_error_function(real: type, fixed_point: bool, with_errors: bool) -> wp.F
     Sums = gradient_types(real, fixed_point).Sums
 
     @wp.func
-    def add_error(sums: Sums, slot: wp.int32, error: real):
+    def add_error(sums: Sums, slot: int, error: real):
         if wp.static(with_errors):
             total = warp_sum(error)
             if lane_index() == 0:
@@ -136,7 +136,7 @@ def buffered_gradients_function(real: type, max_hits: int) -> wp.Function:
     reals, integers = buffer.reals, buffer.integers
 
     @wp.func
-    def buffered_gradients(i: wp.int32, ids: integers, grad_weights: reals, grad_depths: reals):
+    def buffered_gradients(i: int, ids: integers, grad_weights: reals, grad_depths: reals):
         grad_weight = real(0.0)
         grad_depth = real(0.0)
         buffered = bool(False)
@@ -160,13 +160,7 @@ def reduce_slots_kernel(dtype: type) -> wp.Kernel:
 
     @wp.kernel(enable_backward=False, module="unique")
     def reduce_slots(
-        first: wp.int32,
-        order: wp.array(dtype=wp.int32),
-        ends: wp.array(dtype=wp.int32),
-        slots: wp.array2d(dtype=dtype),
-        columns: wp.int32,
-        # outputs
-        sums: wp.array2d(dtype=dtype),
+        first: int, order: ints, ends: ints, slots: wp.array2d(dtype=dtype), columns: int, sums: wp.array2d(dtype=dtype)
     ):
         rank = first + wp.tid()
         start = int(0)
@@ -208,7 +202,7 @@ def collect_backward_kernel(
         launch_bounds=BLOCK_DIM,
     )
     def collect_backward(
-        first: wp.int32,
+        first: int,
         surfels: t.Surfels,
         lists: TileLists,
         view: t.View,

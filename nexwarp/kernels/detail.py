@@ -13,12 +13,11 @@ depth / focal. Written: the depths at which the texture is looked up, at most fo
 focal * nearest; those of empty slots as they are.
 """
 
-import functools
-from types import SimpleNamespace
+from __future__ import annotations
 
 import warp as wp
 
-from nexwarp.kernels.types import Real, Vec2, types
+from nexwarp.kernels.types import Real, Vec2, ints, per_real
 
 # Variance of a pixel's filter, in squared pixels; that of a box is 1/12.
 FILTER = 0.125
@@ -68,88 +67,59 @@ def antialiased_dot(
     return wp.dot(wider, grad_scale) + fainter * grad_opacity + wp.dot(rounder, grad_gamma)
 
 
-@functools.cache
-def antialias_kernels(real: type) -> SimpleNamespace:
-    """Make the kernels."""
-    t = types(real)
-    vec2, ZERO, Parameters = t.vec2, t.ZERO, t.Parameters
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def antialias(
-        first: wp.int32,
-        depths: wp.array(dtype=real),
-        surfels: Parameters,
-        farthest: wp.array(dtype=real),
-        focals: wp.array(dtype=real),
-        blurred: Parameters,
-    ):
-        i = first + wp.tid()
-        scale = surfels.scales[i]
-        opacity = surfels.opacities[i]
-        gamma = surfels.gammas[i]
-        variance = blur(depths[i], focals[0], farthest[i])
-        if variance > ZERO:
-            scale, opacity, gamma = antialiased(scale, opacity, gamma, variance)
-        blurred.scales[i] = scale
-        blurred.opacities[i] = opacity
-        blurred.gammas[i] = gamma
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def antialias_backward(
-        first: wp.int32,
-        depths: wp.array(dtype=real),
-        surfels: Parameters,
-        farthest: wp.array(dtype=real),
-        focals: wp.array(dtype=real),
-        grads: Parameters,
-        grad_depths: wp.array(dtype=real),
-        grad_surfels: Parameters,
-    ):
-        i = first + wp.tid()
-        depth = real(0.0)
-        scale = grads.scales[i]
-        opacity = grads.opacities[i]
-        gamma = grads.gammas[i]
-        if blur(depths[i], focals[0], farthest[i]) > ZERO:
-            depth, scale, opacity, gamma, _pixel, _s, _o, _g = wp.grad(antialiased_dot)(
-                depths[i],
-                surfels.scales[i],
-                surfels.opacities[i],
-                surfels.gammas[i],
-                vec2(focals[0], farthest[i]),
-                scale,
-                opacity,
-                gamma,
-            )
-        grad_depths[i] = depth
-        grad_surfels.scales[i] = scale
-        grad_surfels.opacities[i] = opacity
-        grad_surfels.gammas[i] = gamma
-
-    return SimpleNamespace(forward=antialias, backward=antialias_backward)
+@per_real()
+def antialias(first: int, depths: reals, surfels: Parameters, farthest: reals, focals: reals, blurred: Parameters):
+    i = first + wp.tid()
+    scale = surfels.scales[i]
+    opacity = surfels.opacities[i]
+    gamma = surfels.gammas[i]
+    variance = blur(depths[i], focals[0], farthest[i])
+    if variance > ZERO:
+        scale, opacity, gamma = antialiased(scale, opacity, gamma, variance)
+    blurred.scales[i] = scale
+    blurred.opacities[i] = opacity
+    blurred.gammas[i] = gamma
 
 
-@functools.cache
-def limit_depths_kernel(real: type) -> wp.Kernel:
-    """Make the kernel."""
+@per_real()
+def antialias_backward(
+    first: int,
+    depths: reals,
+    surfels: Parameters,
+    farthest: reals,
+    focals: reals,
+    grads: Parameters,
+    grad_depths: reals,
+    grad_surfels: Parameters,
+):
+    i = first + wp.tid()
+    depth = real(0.0)
+    scale = grads.scales[i]
+    opacity = grads.opacities[i]
+    gamma = grads.gammas[i]
+    if blur(depths[i], focals[0], farthest[i]) > ZERO:
+        depth, scale, opacity, gamma, _pixel, _s, _o, _g = wp.grad(antialiased_dot)(
+            depths[i],
+            surfels.scales[i],
+            surfels.opacities[i],
+            surfels.gammas[i],
+            vec2(focals[0], farthest[i]),
+            scale,
+            opacity,
+            gamma,
+        )
+    grad_depths[i] = depth
+    grad_surfels.scales[i] = scale
+    grad_surfels.opacities[i] = opacity
+    grad_surfels.gammas[i] = gamma
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def limit_depths(
-        first: wp.int32,
-        ids: wp.array(dtype=wp.int32),
-        depths: wp.array(dtype=real),
-        nearest: wp.array(dtype=real),
-        farthest: wp.array(dtype=real),
-        focals: wp.array(dtype=real),
-        # outputs
-        limited: wp.array(dtype=real),
-    ):
-        k = first + wp.tid()
-        i = ids[k]
-        depth = depths[k]
-        if i >= 0:
-            # `nearest` is applied last: where no training view saw the texture, it is huge and removes all detail.
-            depth = wp.max(wp.min(depth, focals[0] * farthest[i]), focals[0] * nearest[i])
-        limited[k] = depth
 
-    return limit_depths
+@per_real()
+def limit_depths(first: int, ids: ints, depths: reals, nearest: reals, farthest: reals, focals: reals, limited: reals):
+    k = first + wp.tid()
+    i = ids[k]
+    depth = depths[k]
+    if i >= 0:
+        # `nearest` is applied last: where no training view saw the texture, it is huge and removes all detail.
+        depth = wp.max(wp.min(depth, focals[0] * farthest[i]), focals[0] * nearest[i])
+    limited[k] = depth

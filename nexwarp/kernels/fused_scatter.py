@@ -223,7 +223,7 @@ def fused_scatter_kernel(features: int) -> wp.Kernel:
     @wp.kernel(
         enable_backward=False, grid_stride=False, module="unique", launch_bounds=(SCATTER_THREADS, SCATTER_BLOCKS)
     )
-    def fused_scatter(first: wp.int32, fused: Fused):
+    def fused_scatter(first: int, fused: Fused):
         scatter(first + wp.tid(), fused)
 
     return fused_scatter

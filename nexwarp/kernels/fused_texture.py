@@ -83,14 +83,7 @@ def power_of_two(exponent: wp.int32) -> wp.float32:
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def half_scale(
-    first: wp.int32,
-    largest: Real,
-    target: wp.float32,
-    # outputs
-    scale: Real,
-    unscale: Real,
-):
+def half_scale(first: int, largest: Real, target: wp.float32, scale: Real, unscale: Real):
     """Power of two that brings `largest` near `target`, and its inverse."""
     exponent = wp.clamp(int(wp.floor(wp.log2(target / wp.max(largest[0], 1.0e-30)))), -24, 60)
     scale[first + wp.tid()] = power_of_two(exponent)
@@ -99,13 +92,7 @@ def half_scale(
 
 @wp.kernel(enable_backward=False, module="unique")
 def pack_matrices(
-    first: wp.int32,
-    matrix1: Real,
-    matrix2: Real,
-    matrix3: Real,
-    sources: Word,
-    # outputs
-    packed: wp.array(dtype=wp.float16),
+    first: int, matrix1: Real, matrix2: Real, matrix3: Real, sources: Word, packed: wp.array(dtype=wp.float16)
 ):
     """Gather the matrices' values, one matrix after another; what lies after the last one is 0."""
     i = first + wp.tid()
@@ -125,14 +112,7 @@ def pack_matrices(
 
 
 @wp.kernel(enable_backward=False, module="unique")
-def order_gradients(
-    first: wp.int32,
-    sums: Real,
-    order: Word,
-    unscale: Real,
-    # outputs
-    gradients: Real,
-):
+def order_gradients(first: int, sums: Real, order: Word, unscale: Real, gradients: Real):
     """Put the matrices' gradients into the order of the matrices' values."""
     i = first + wp.tid()
     gradients[i] = sums[order[i]] * unscale[0]
@@ -154,13 +134,13 @@ def fused_kernels(features: int) -> SimpleNamespace:
     @wp.kernel(
         enable_backward=False, grid_stride=False, module="unique", launch_bounds=(FORWARD_THREADS, FORWARD_BLOCKS)
     )
-    def fused_forward(first: wp.int32, threads: wp.int32, fused: Fused):
+    def fused_forward(first: int, threads: int, fused: Fused):
         forward(first + wp.tid(), threads, fused)
 
     @wp.kernel(
         enable_backward=False, grid_stride=False, module="unique", launch_bounds=(BACKWARD_THREADS, BACKWARD_BLOCKS)
     )
-    def fused_backward(first: wp.int32, threads: wp.int32, fused: Fused, clamped: Vec3):
+    def fused_backward(first: int, threads: int, fused: Fused, clamped: Vec3):
         # Colours that were clamped, else empty; apart from the struct, where it would cost registers.
         backward(first + wp.tid(), threads, fused, clamped)
 

@@ -22,7 +22,7 @@ from typing import Any
 
 import warp as wp
 
-from nexwarp.kernels.types import types
+from nexwarp.kernels.types import ints, types
 from nexwarp.native.fixed_point import fixed_point_units
 from nexwarp.native.vector_loads import load_function
 
@@ -96,13 +96,13 @@ def merge_functions(features: int) -> SimpleNamespace:
 
 
 @wp.func
-def map_positive(i: wp.int32):
+def map_positive(i: int):
     """Fold the integers onto the non-negative ones: 0, 1, -1, 2, -2 ... -> 0, 1, 2, 3, 4 ..."""
     return wp.uint32(wp.where(i > 0, 2 * i - 1, -2 * i))
 
 
 @wp.func
-def hash_slot(corner: wp.vec3i, j: wp.int32, mask: wp.uint32):
+def hash_slot(corner: wp.vec3i, j: int, mask: wp.uint32):
     """Table slot of corner j of a cell."""
     x = map_positive(corner[0] + (j & 1))
     y = map_positive(corner[1] + ((j >> 1) & 1)) * PRIME_Y
@@ -173,7 +173,7 @@ def scatter_function(real: type, features: int, fixed_point: bool) -> wp.Functio
             mask: wp.uint32,
             grads: mat,
             units: wp.array(dtype=wp.float64),
-            bad: wp.array(dtype=wp.int32),
+            bad: ints,
         ):
             for j in range(8):
                 first = int(hash_slot(corner, j, mask)) * wp.static(features)
@@ -193,7 +193,7 @@ def scatter_function(real: type, features: int, fixed_point: bool) -> wp.Functio
         mask: wp.uint32,
         grads: mat,
         units: wp.array(dtype=wp.float64),
-        bad: wp.array(dtype=wp.int32),
+        bad: ints,
     ):
         total = grads
         if wp.static(merged):
@@ -218,10 +218,10 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
     `real` or wp.float16. With `fixed_point` the backward kernel adds to the table integers, `units` of them in 1.
     """
     t = types(real)
-    vec3, vec4 = t.vec3, t.vec4
+    vec4 = t.vec4
     row = wp.types.vector(length=features, dtype=storage)
     vec = wp.types.vector(length=features, dtype=real)
-    ZERO = t.ZERO
+    reals, vec3s, vec4_rows, ZERO = t.reals, t.vec3s, t.vec4_rows, t.ZERO
     gather = gather_function(real, storage, features)
     scatter = scatter_function(real, features, fixed_point)
     options = {"fast_math": real is wp.float32}
@@ -229,12 +229,12 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
 
     @wp.kernel(enable_backward=False, module="unique", module_options=options)
     def hashgrid(
-        first: wp.int32,
+        first: int,
         table: wp.array2d(dtype=row),
-        positions: wp.array(dtype=vec3),
-        depths: wp.array(dtype=real),
-        resolutions: wp.array(dtype=real),
-        focal: wp.array(dtype=real),
+        positions: vec3s,
+        depths: reals,
+        resolutions: reals,
+        focal: reals,
         mask: wp.uint32,
         # outputs
         encoded: wp.array2d(dtype=storage),
@@ -255,21 +255,21 @@ def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool
 
     @wp.kernel(enable_backward=False, module="unique", module_options=options)
     def hashgrid_backward(  # noqa: PLR0913  # a kernel entry point
-        first: wp.int32,
+        first: int,
         table: wp.array2d(dtype=row),
-        positions: wp.array(dtype=vec3),
-        depths: wp.array(dtype=real),
-        resolutions: wp.array(dtype=real),
-        focal: wp.array(dtype=real),
+        positions: vec3s,
+        depths: reals,
+        resolutions: reals,
+        focal: reals,
         mask: wp.uint32,
         grad_encoded: wp.array2d(dtype=storage),
-        unscale: wp.array(dtype=real),
+        unscale: reals,
         units: wp.array(dtype=wp.float64),
-        levels_per_thread: wp.int32,
+        levels_per_thread: int,
         # outputs
         grad_table: table_of_sums,
-        grad_points: wp.array2d(dtype=vec4),
-        bad: wp.array(dtype=wp.int32),
+        grad_points: vec4_rows,
+        bad: ints,
     ):
         r_, p = wp.tid()
         run = first + r_

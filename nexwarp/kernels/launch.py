@@ -130,11 +130,7 @@ _commands_lock = threading.Lock()
 
 
 def _launch_again(
-    kernel: wp.Kernel,
-    shape: tuple[int, ...],
-    values: list[Any],
-    stream: wp.Stream,
-    block_dim: int,
+    kernel: wp.Kernel, shape: tuple[int, ...], values: list[Any], stream: wp.Stream, block_dim: int
 ) -> None:
     """Launch on a GPU by the kernel's command. Threads take turns: a command's arguments are its own."""
     device = stream.device

@@ -6,15 +6,14 @@ those of records. Centres sort and limits cull: both are frozen. The backward ke
 product of outputs and their gradients.
 """
 
-import functools
-from types import SimpleNamespace
+from __future__ import annotations
 
 import warp as wp
 
 from nexwarp.kernels.activate import unit
 from nexwarp.kernels.shape import exponent_limit
 from nexwarp.kernels.surfel import axes, rotate, translation
-from nexwarp.kernels.types import Mat44, Vec2, Vec3, Vec4, types
+from nexwarp.kernels.types import Mat44, Vec2, Vec3, Vec4, per_real
 from nexwarp.native.vector_loads import load_record, store_record_row
 
 # Nobody sees a surfel as small: its inverse is finite, and so are products with what a scene has else.
@@ -48,66 +47,35 @@ def placed_dot(mean: Vec3, quat: Vec4, scale: Vec2, viewmat: Mat44, grad_a: Vec4
     )
 
 
-@functools.cache
-def project_kernels(real: type) -> SimpleNamespace:
-    """Make the projection kernel and its derivative."""
-    t = types(real)
-    vec2, vec3, vec4, mat44 = t.vec2, t.vec3, t.vec4, t.mat44
+@per_real()
+def project(first: int, surfels: Parameters, viewmats: mat44s, records: vec4_rows, centers: vec3s, limits: reals):
+    i = first + wp.tid()
+    opacity = surfels.opacities[i]
+    gamma = surfels.gammas[i]
+    a, b, n, center = placed(surfels.means[i], surfels.quats[i], surfels.scales[i], viewmats[0])
+    color = surfels.colors[i]
+    store_record_row(records, i, 0, vec4(a[0], a[1], a[2], opacity))
+    store_record_row(records, i, 1, vec4(b[0], b[1], b[2], gamma[0]))
+    store_record_row(records, i, 2, vec4(n[0], n[1], n[2], gamma[1]))
+    store_record_row(records, i, 3, vec4(color[0], color[1], color[2], wp.dot(center, n)))
+    centers[i] = center
+    limits[i] = exponent_limit(opacity)
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def project(  # noqa: PLR0913  # a kernel entry point
-        first: wp.int32,
-        means: wp.array(dtype=vec3),
-        quats: wp.array(dtype=vec4),
-        scales: wp.array(dtype=vec2),
-        opacities: wp.array(dtype=real),
-        gammas: wp.array(dtype=vec2),
-        colors: wp.array(dtype=vec3),
-        viewmats: wp.array(dtype=mat44),
-        # outputs
-        records: wp.array2d(dtype=vec4),
-        centers: wp.array(dtype=vec3),
-        limits: wp.array(dtype=real),
-    ):
-        i = first + wp.tid()
-        a, b, n, center = placed(means[i], quats[i], scales[i], viewmats[0])
-        color = colors[i]
-        store_record_row(records, i, 0, vec4(a[0], a[1], a[2], opacities[i]))
-        store_record_row(records, i, 1, vec4(b[0], b[1], b[2], gammas[i][0]))
-        store_record_row(records, i, 2, vec4(n[0], n[1], n[2], gammas[i][1]))
-        store_record_row(records, i, 3, vec4(color[0], color[1], color[2], wp.dot(center, n)))
-        centers[i] = center
-        limits[i] = exponent_limit(opacities[i])
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def project_backward(  # noqa: PLR0913  # a kernel entry point
-        first: wp.int32,
-        means: wp.array(dtype=vec3),
-        quats: wp.array(dtype=vec4),
-        scales: wp.array(dtype=vec2),
-        viewmats: wp.array(dtype=mat44),
-        grad_records: wp.array2d(dtype=vec4),
-        # outputs
-        grad_means: wp.array(dtype=vec3),
-        grad_quats: wp.array(dtype=vec4),
-        grad_scales: wp.array(dtype=vec2),
-        grad_opacities: wp.array(dtype=real),
-        grad_gammas: wp.array(dtype=vec2),
-        grad_colors: wp.array(dtype=vec3),
-        grad_viewmats: wp.array(dtype=mat44),
-    ):
-        i = first + wp.tid()
-        a, b, n, c = load_record(grad_records, i)
-        mean, quat, scale, viewmat, _a, _b, _n, _c = wp.grad(placed_dot)(
-            means[i], quats[i], scales[i], viewmats[0], a, b, n, c
-        )
-        grad_means[i] = mean
-        grad_quats[i] = quat
-        grad_scales[i] = scale
-        grad_opacities[i] = a[3]
-        grad_gammas[i] = vec2(b[3], n[3])
-        grad_colors[i] = vec3(c[0], c[1], c[2])
-        if grad_viewmats:
-            grad_viewmats[i] = viewmat
-
-    return SimpleNamespace(forward=project, backward=project_backward)
+@per_real()
+def project_backward(
+    first: int, surfels: Parameters, viewmats: mat44s, grad_records: vec4_rows, grads: Parameters, grad_viewmats: mat44s
+):
+    i = first + wp.tid()
+    a, b, n, c = load_record(grad_records, i)
+    mean, quat, scale, viewmat, _a, _b, _n, _c = wp.grad(placed_dot)(
+        surfels.means[i], surfels.quats[i], surfels.scales[i], viewmats[0], a, b, n, c
+    )
+    grads.means[i] = mean
+    grads.quats[i] = quat
+    grads.scales[i] = scale
+    grads.opacities[i] = a[3]
+    grads.gammas[i] = vec2(b[3], n[3])
+    grads.colors[i] = vec3(c[0], c[1], c[2])
+    if grad_viewmats:
+        grad_viewmats[i] = viewmat

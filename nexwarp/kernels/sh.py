@@ -91,8 +91,8 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
     writes one coefficient and neighbours write neighbouring addresses; one alone evaluates the basis but once. Both
     read the colours: where one is 0 it was clamped and has no gradient.
     """
-    vec3 = types(real).vec3
-    basis = basis_function(real, degree)
+    t, basis = types(real), basis_function(real, degree)
+    vec3, vec3s, vec3_rows = t.vec3, t.vec3s, t.vec3_rows
     count = (degree + 1) ** 2
     vec = wp.types.vector(length=count, dtype=real)
 
@@ -101,15 +101,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
         return wp.dot(basis(direction_of(ray)), w)
 
     @wp.kernel(enable_backward=False, module="unique")
-    def plain_colors(
-        first: wp.int32,
-        sh0: wp.array2d(dtype=vec3),
-        shN: wp.array2d(dtype=vec3),
-        means: wp.array(dtype=vec3),
-        position: wp.array(dtype=vec3),
-        # outputs
-        colors: wp.array(dtype=vec3),
-    ):
+    def plain_colors(first: int, sh0: vec3_rows, shN: vec3_rows, means: vec3s, position: vec3s, colors: vec3s):
         i = first + wp.tid()
         b = basis(direction_of(means[i] - position[0]))
         color = vec3(real(0.5), real(0.5), real(0.5)) + sh0[i, 0] * b[0]
@@ -119,15 +111,15 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module="unique")
     def plain_coefficients_backward(
-        first: wp.int32,
-        sharing: wp.int32,
-        means: wp.array(dtype=vec3),
-        position: wp.array(dtype=vec3),
-        colors: wp.array(dtype=vec3),
-        grad_colors: wp.array(dtype=vec3),
+        first: int,
+        sharing: int,
+        means: vec3s,
+        position: vec3s,
+        colors: vec3s,
+        grad_colors: vec3s,
         # outputs
-        grad_sh0: wp.array2d(dtype=vec3),
-        grad_shN: wp.array2d(dtype=vec3),
+        grad_sh0: vec3_rows,
+        grad_shN: vec3_rows,
     ):
         thread = first + wp.tid()
         i = thread // sharing
@@ -145,14 +137,7 @@ def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
 
     @wp.kernel(enable_backward=False, module="unique")
     def plain_rays_backward(
-        first: wp.int32,
-        shN: wp.array2d(dtype=vec3),
-        means: wp.array(dtype=vec3),
-        position: wp.array(dtype=vec3),
-        colors: wp.array(dtype=vec3),
-        grad_colors: wp.array(dtype=vec3),
-        # outputs
-        grad_rays: wp.array(dtype=vec3),
+        first: int, shN: vec3_rows, means: vec3s, position: vec3s, colors: vec3s, grad_colors: vec3s, grad_rays: vec3s
     ):
         i = first + wp.tid()
         grad = unclamped(grad_colors[i], colors[i])
@@ -173,8 +158,8 @@ def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool)
 
     The backward kernel stores grad_coefficients times `scale[0]`, so that half precision holds them.
     """
-    vec3 = types(real).vec3
-    basis = basis_function(real, degree)
+    t, basis = types(real), basis_function(real, degree)
+    vec3, reals, vec3s = t.vec3, t.reals, t.vec3s
     count = (degree + 1) ** 2
     vec = wp.types.vector(length=count, dtype=real)
 
@@ -193,13 +178,7 @@ def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool)
 
     @wp.kernel(enable_backward=False, module="unique")
     def textured_colors(
-        first: wp.int32,
-        coefficients: wp.array2d(dtype=storage),
-        directions: wp.array(dtype=vec3),
-        hits: wp.int32,
-        offset: real,
-        # outputs
-        colors: wp.array(dtype=vec3),
+        first: int, coefficients: wp.array2d(dtype=storage), directions: vec3s, hits: int, offset: real, colors: vec3s
     ):
         i = first + wp.tid()
         color = color_of(coefficients, i, basis(directions[i // hits]), offset)
@@ -209,16 +188,16 @@ def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool)
 
     @wp.kernel(enable_backward=False, module="unique")
     def textured_colors_backward(  # noqa: PLR0913  # a kernel entry point
-        first: wp.int32,
+        first: int,
         coefficients: wp.array2d(dtype=storage),
-        directions: wp.array(dtype=vec3),
-        hits: wp.int32,
+        directions: vec3s,
+        hits: int,
         offset: real,
-        scale: wp.array(dtype=real),
-        grad_colors: wp.array(dtype=vec3),
+        scale: reals,
+        grad_colors: vec3s,
         # outputs
         grad_coefficients: wp.array2d(dtype=storage),
-        grad_directions: wp.array(dtype=vec3),
+        grad_directions: vec3s,
     ):
         i = first + wp.tid()
         direction = directions[i // hits]

@@ -19,6 +19,7 @@ import math
 import warp as wp
 
 from nexwarp.kernels.photometric import clamped, clamped_backward
+from nexwarp.kernels.types import types
 from nexwarp.native.warp import lane_index, warp_size, warp_sum
 
 WINDOW_SIZE = 11
@@ -26,6 +27,7 @@ WINDOW_SIGMA = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
 REACH = WINDOW_SIZE // 2
+reals, real_rows = types(wp.float32).reals, types(wp.float32).real_rows
 _GAUSSIAN = [math.exp(-((i - REACH) ** 2) / (2.0 * WINDOW_SIGMA**2)) for i in range(WINDOW_SIZE)]
 
 PIXELS, ROWS = 64, 8
@@ -103,7 +105,7 @@ HALF_C1, HALF_C2 = wp.constant(C1 / 2.0), wp.constant(C2 / 2.0)
 
 
 @wp.func
-def place(thread: wp.int32, width: wp.int32):
+def place(thread: int, width: int):
     """(thread of its block, left column, top row) of the block's strip."""
     block = thread // THREADS
     strips = (width + COLUMNS - 1) // COLUMNS
@@ -111,32 +113,32 @@ def place(thread: wp.int32, width: wp.int32):
 
 
 @wp.func
-def put(plane: wp.int32, lane: wp.int32, values: Sums):
+def put(plane: int, lane: int, values: Sums):
     """Share a column's values."""
     for j in range(wp.static(ROWS)):
         cell(True, (plane * ROWS + j) * THREADS + lane, values[j])
 
 
 @wp.func
-def put_group(plane: wp.int32, lane: wp.int32, values: Sums):
+def put_group(plane: int, lane: int, values: Sums):
     """Share a group's values, at the columns that they are for."""
     for o in range(wp.static(GROUP)):
         cell(True, plane * wp.static(ROWS * THREADS) + group_start(lane) + 3 * o, values[o])
 
 
 @wp.func
-def group_start(lane: wp.int32):
+def group_start(lane: int):
     """Where in a plane a thread's group begins: a row, and a column relative to the strip's left."""
     return (lane // wp.static(COLUMNS // GROUP)) * THREADS + group_column(lane)
 
 
 @wp.func
-def group_column(lane: wp.int32):
+def group_column(lane: int):
     return lane % 3 + (lane // 3) % wp.static(PIXELS // GROUP) * wp.static(3 * GROUP)
 
 
 @wp.func
-def blur(plane: wp.int32, lane: wp.int32):
+def blur(plane: int, lane: int):
     """Blur a thread's group of a plane along its row."""
     start = plane * wp.static(ROWS * THREADS) + group_start(lane)
     sums = Sums()
@@ -146,14 +148,7 @@ def blur(plane: wp.int32, lane: wp.int32):
 
 
 @wp.func
-def write_columns(
-    derivatives: wp.array2d(dtype=wp.float32),
-    lane: wp.int32,
-    column: wp.int32,
-    top: wp.int32,
-    height: wp.int32,
-    width: wp.int32,
-):
+def write_columns(derivatives: real_rows, lane: int, column: int, top: int, height: int, width: wp.int32):
     """Write a thread's column of the three shared planes to the maps."""
     if lane < COLUMNS and column < width:
         for j in range(wp.static(ROWS)):
@@ -190,15 +185,15 @@ OPTIONS = {
 
 @wp.kernel(**OPTIONS)
 def score(
-    first: wp.int32,
-    image: wp.array(dtype=wp.float32),
-    target: wp.array(dtype=wp.float32),
-    height: wp.int32,
-    width: wp.int32,
+    first: int,
+    image: reals,
+    target: reals,
+    height: int,
+    width: int,
     scale: wp.float32,
     # outputs
-    losses: wp.array(dtype=wp.float32),
-    derivatives: wp.array2d(dtype=wp.float32),
+    losses: reals,
+    derivatives: real_rows,
 ):
     """Sums of (1 - s) scale, one a warp, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
     thread = first + wp.tid()
@@ -259,16 +254,16 @@ def score(
 
 @wp.kernel(**OPTIONS)
 def gradient(  # noqa: PLR0913  # a kernel entry point
-    first: wp.int32,
-    derivatives: wp.array2d(dtype=wp.float32),
-    image: wp.array(dtype=wp.float32),
-    target: wp.array(dtype=wp.float32),
-    height: wp.int32,
-    width: wp.int32,
+    first: int,
+    derivatives: real_rows,
+    image: reals,
+    target: reals,
+    height: int,
+    width: int,
     scale: wp.float32,
-    grad_loss: wp.array(dtype=wp.float32),
+    grad_loss: reals,
     # outputs
-    grad_image: wp.array(dtype=wp.float32),
+    grad_image: reals,
 ):
     at = place(first + wp.tid(), width)
     lane = at[0]

@@ -13,92 +13,71 @@ All are 0 where nothing is hit. `surface_backward` differentiates all four. It n
 out.
 """
 
-import functools
+from __future__ import annotations
 
 import warp as wp
 
 from nexwarp.kernels.surfel import facing_side, hit, hit_alpha
-from nexwarp.kernels.types import TileLists, types
+from nexwarp.kernels.types import TileLists, ints, per_real
 from nexwarp.kernels.walk import block_of, candidate, overflowed, pixel_of, tile_of, walk
 from nexwarp.native.vector_loads import load_record
 from nexwarp.native.warp import ballot, from_lane, lane_index, lowest_lane, warp_max, warp_size
 
 
-@functools.cache
-def surface_kernel(real: type) -> wp.Kernel:
-    """Make the kernel."""
-    t = types(real)
-    vec3 = t.vec3
-    ALPHA_MIN, ZERO, HALF, ONE = t.ALPHA_MIN, t.ZERO, t.HALF, t.ONE
-
-    @wp.kernel(
-        enable_backward=False,
-        grid_stride=False,
-        module="unique",
-        module_options={"fast_math": real is wp.float32},
-    )
-    def surface(
-        first: wp.int32,
-        surfels: t.Surfels,
-        lists: TileLists,
-        view: t.View,
-        stops: wp.array(dtype=wp.int32),
-        surface: t.Surface,
-    ):
-        thread = first + wp.tid()
-        xy, inside, d = pixel_of(thread, view)
-        middle, half = block_of(xy, view)
-        stop = int(0)
-        if inside:
-            stop = stops[xy[1] * view.size[0] + xy[0]]
-        transmittance = real(1.0)
-        total = real(0.0)
-        depths = real(0.0)
-        median_depth = real(0.0)
-        heaviest = real(0.0)
-        top_depth = real(0.0)
-        normals = vec3()
-        pick = wp.vec2i(-1, -1)
-        overflow = overflowed(lists)
-        bounds = walk(tile_of(thread), lists, overflow)
-        width = warp_size()
-        lane = lane_index()
-        last = wp.min(warp_max(stop), bounds[1])
-        for batch in range(bounds[0], last, width):
-            mine = candidate(batch + lane, last, surfels, lists, overflow, middle, half)
-            left = ballot(wp.where(mine >= 0, 1, 0))
-            while left != 0:
-                source = lowest_lane(left)
-                left = left & (left - 1)
-                i = from_lane(mine, source)
-                if batch + source < stop:
-                    a, b, n, c = load_record(surfels.records, i)
-                    u, v, depth = hit(a, b, n, c[3], d)
-                    alpha = hit_alpha(a, b, n, u, v, surfels.limits[i])
-                    if alpha >= ALPHA_MIN and depth > view.near:
-                        weight = alpha * transmittance
-                        if transmittance > HALF:
-                            median_depth = depth
-                            pick[0] = batch + source
-                        if weight > heaviest:
-                            heaviest = weight
-                            top_depth = depth
-                            pick[1] = batch + source
-                        normals += vec3(n[0], n[1], n[2]) * (facing_side(n, d) * weight)
-                        total += weight
-                        depths += weight * depth
-                        transmittance = transmittance * (ONE - alpha)
-        if not inside:
-            return
-        if total > ZERO:
-            depths = depths / total
-        p = xy[1] * view.size[0] + xy[0]
-        surface.expected[p] = depths
-        surface.median[p] = median_depth
-        surface.top[p] = top_depth
-        surface.normals[p] = normals
-        if surface.picks:
-            surface.totals[p] = total
-            surface.picks[p] = pick
-
-    return surface
+@per_real(grid_stride=False, fast_math=True)
+def surface(first: int, surfels: Surfels, lists: TileLists, view: View, stops: ints, surface: Surface):
+    thread = first + wp.tid()
+    xy, inside, d = pixel_of(thread, view)
+    middle, half = block_of(xy, view)
+    stop = int(0)
+    if inside:
+        stop = stops[xy[1] * view.size[0] + xy[0]]
+    transmittance = real(1.0)
+    total = real(0.0)
+    depths = real(0.0)
+    median_depth = real(0.0)
+    heaviest = real(0.0)
+    top_depth = real(0.0)
+    normals = vec3()
+    pick = wp.vec2i(-1, -1)
+    overflow = overflowed(lists)
+    bounds = walk(tile_of(thread), lists, overflow)
+    width = warp_size()
+    lane = lane_index()
+    last = wp.min(warp_max(stop), bounds[1])
+    for batch in range(bounds[0], last, width):
+        mine = candidate(batch + lane, last, surfels, lists, overflow, middle, half)
+        left = ballot(wp.where(mine >= 0, 1, 0))
+        while left != 0:
+            source = lowest_lane(left)
+            left = left & (left - 1)
+            i = from_lane(mine, source)
+            if batch + source < stop:
+                a, b, n, c = load_record(surfels.records, i)
+                u, v, depth = hit(a, b, n, c[3], d)
+                alpha = hit_alpha(a, b, n, u, v, surfels.limits[i])
+                if alpha >= ALPHA_MIN and depth > view.near:
+                    weight = alpha * transmittance
+                    if transmittance > HALF:
+                        median_depth = depth
+                        pick[0] = batch + source
+                    if weight > heaviest:
+                        heaviest = weight
+                        top_depth = depth
+                        pick[1] = batch + source
+                    normals += vec3(n[0], n[1], n[2]) * (facing_side(n, d) * weight)
+                    total += weight
+                    depths += weight * depth
+                    transmittance = transmittance * (ONE - alpha)
+    if not inside:
+        return
+    if total > ZERO:
+        depths = depths / total
+    p = xy[1] * view.size[0] + xy[0]
+    surface.expected[p] = depths
+    surface.median[p] = median_depth
+    surface.top[p] = top_depth
+    surface.normals[p] = normals
+    if surface.picks:
+        surface.totals[p] = total
+        surface.picks[p] = pick

@@ -19,7 +19,7 @@ import warp as wp
 
 from nexwarp.kernels.collect_backward import add_function, gradient_types
 from nexwarp.kernels.surfel import facing_side, hit, hit_alpha, hit_gradients, record_gradients
-from nexwarp.kernels.types import TileLists, types
+from nexwarp.kernels.types import TileLists, ints, types
 from nexwarp.kernels.walk import block_of, candidate, overflowed, pixel_of, tile_of, walk
 from nexwarp.native.vector_loads import load_record
 from nexwarp.native.warp import (
@@ -49,11 +49,11 @@ def surface_backward_kernel(real: type, fixed_point: bool = False, by_place: boo
         module_options={"fast_math": real is wp.float32},
     )
     def surface_backward(
-        first: wp.int32,
+        first: int,
         surfels: t.Surfels,
         lists: TileLists,
         view: t.View,
-        stops: wp.array(dtype=wp.int32),
+        stops: ints,
         surface: t.Surface,
         grads: t.Surface,
         sums: g.Sums,

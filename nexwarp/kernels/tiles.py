@@ -8,7 +8,8 @@ tiles that the polygon touches are listed exactly, not those of its bounding box
 decides.
 """
 
-import functools
+from __future__ import annotations
+
 from typing import Any
 
 import warp as wp
@@ -16,15 +17,14 @@ import warp as wp
 from nexwarp.kernels.activate import unit
 from nexwarp.kernels.shape import reach
 from nexwarp.kernels.surfel import axes, intrinsics_of, rotate, translation
-from nexwarp.kernels.types import Real, Vec3, Vec4, types
+from nexwarp.kernels.types import Real, Vec3, Vec4, per_real
 from nexwarp.native.vector_loads import load_pair
 from nexwarp.native.warp import tile_size
 
 # Pixels added around the polygon: rounding must never cull a hit.
 MARGIN = 0.01
-RELATIVE_MARGIN = 1e-6
-LARGEST = 1e30
-HUGE = wp.constant(wp.float64(LARGEST))
+RELATIVE_MARGIN = wp.constant(wp.float64(1e-6))
+HUGE = wp.constant(wp.float64(1e30))
 SHORT_OF_NEAR = wp.constant(wp.float64(0.999))
 # Of a quad that one plane clips.
 MAX_CORNERS = 5
@@ -89,77 +89,61 @@ def clip(i: int, quad: Any, plane: Real, intrinsics: Vec4, corners: Any):
     return count, low, high, nearest
 
 
-@functools.cache
-def tile_polygon_kernel(real: type) -> wp.Kernel:
-    """Make the kernel that projects supports to polygons, one thread a surfel."""
-    t = types(real)
-    vec2, vec3, vec4, mat33, mat44 = t.vec2, t.vec3, t.vec4, t.mat33, t.mat44
-    mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
-    ZERO, HALF, ONE = t.ZERO, t.HALF, t.ONE
-    HUGE = wp.constant(real(LARGEST))
-    RELATIVE = wp.constant(real(RELATIVE_MARGIN))
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def tile_polygon(  # noqa: PLR0913  # a kernel entry point
-        first: wp.int32,
-        means: wp.array(dtype=vec3),
-        quats: wp.array(dtype=vec4),
-        scales: wp.array(dtype=vec2),
-        opacities: wp.array(dtype=real),
-        gammas: wp.array(dtype=vec2),
-        viewmats: wp.array(dtype=mat44),
-        Ks: wp.array(dtype=mat33),
-        near: real,
-        tile_rows: wp.int32,
-        # outputs
-        reaches: wp.array(dtype=vec2),
-        polygons: t.Polygons,
-    ):
-        i = first + wp.tid()
-        side = real(float(tile_size()))
-        # Nothing to see: no corners, and no rows.
-        polygons.shapes[i] = wp.vec3i(0, 0, -1)
-        polygons.margins[i] = ZERO
-        extent = reach(opacities[i], gammas[i])
-        reaches[i] = extent
-        if not (extent[0] > ZERO):
-            return
-        viewmat = viewmats[0]
-        intrinsics = intrinsics_of(Ks[0])
-        x_axis, y_axis, _normal = axes(unit(quats[i]))
-        center = rotate(viewmat, means[i]) + translation(viewmat)
-        v1 = rotate(viewmat, x_axis) * (scales[i][0] * extent[0])
-        v2 = rotate(viewmat, y_axis) * (scales[i][1] * extent[1])
-        quad = mat43()
+@per_real()
+def tile_polygon(
+    first: int,
+    surfels: Parameters,
+    viewmats: mat44s,
+    Ks: mat33s,
+    near: real,
+    tile_rows: int,
+    # outputs
+    reaches: vec2s,
+    polygons: Polygons,
+):
+    i = first + wp.tid()
+    side = real(float(tile_size()))
+    # Nothing to see: no corners, and no rows.
+    polygons.shapes[i] = wp.vec3i(0, 0, -1)
+    polygons.margins[i] = ZERO
+    extent = reach(surfels.opacities[i], surfels.gammas[i])
+    reaches[i] = extent
+    if not (extent[0] > ZERO):
+        return
+    viewmat = viewmats[0]
+    intrinsics = intrinsics_of(Ks[0])
+    x_axis, y_axis, _normal = axes(unit(surfels.quats[i]))
+    center = rotate(viewmat, surfels.means[i]) + translation(viewmat)
+    v1 = rotate(viewmat, x_axis) * (surfels.scales[i][0] * extent[0])
+    v2 = rotate(viewmat, y_axis) * (surfels.scales[i][1] * extent[1])
+    quad = wp.matrix(shape=(4, 3), dtype=real)
+    for k in range(4):
+        s1 = wp.where(k == 0 or k == 3, ONE, -ONE)
+        s2 = wp.where(k < 2, ONE, -ONE)
+        corner = center + v1 * s1 + v2 * s2
+        quad[k, 0] = corner[0]
+        quad[k, 1] = corner[1]
+        quad[k, 2] = corner[2]
+    count, low, high, nearest = clip(i, quad, near_plane(near, center), intrinsics, polygons.corners)
+    if count == 0:
+        return
+    size = wp.max(wp.max(wp.abs(low[0]), wp.abs(low[1])), wp.max(wp.abs(high[0]), wp.abs(high[1])))
+    if not (size < real(HUGE)):
+        # Too large for arithmetic, or not a number: list it everywhere, the walk decides.
         for k in range(4):
-            s1 = wp.where(k == 0 or k == 3, ONE, -ONE)
-            s2 = wp.where(k < 2, ONE, -ONE)
-            corner = center + v1 * s1 + v2 * s2
-            quad[k, 0] = corner[0]
-            quad[k, 1] = corner[1]
-            quad[k, 2] = corner[2]
-        count, low, high, nearest = clip(i, quad, near_plane(near, center), intrinsics, polygons.corners)
-        if count == 0:
-            return
-        size = wp.max(wp.max(wp.abs(low[0]), wp.abs(low[1])), wp.max(wp.abs(high[0]), wp.abs(high[1])))
-        if not (size < HUGE):
-            # Too large for arithmetic, or not a number: list it everywhere, the walk decides.
-            for k in range(4):
-                x = wp.where(k == 0 or k == 3, -HUGE, HUGE)
-                polygons.corners[i, k] = vec2(x, wp.where(k < 2, -HUGE, HUGE))
-            polygons.shapes[i] = wp.vec3i(4, 0, tile_rows - 1)
-            return
-        # A corner is known to a rounding of the extent: pixels by the focal length over the depth.
-        diameter = wp.length(center) + wp.length(v1) + wp.length(v2)
-        blur = RELATIVE * diameter * wp.max(intrinsics[0], intrinsics[1]) / nearest
-        margin = real(MARGIN) + RELATIVE * size + blur
-        # A tile's samples are its pixel centres, half a pixel inside its border.
-        y0 = tile_index((low[1] - margin + HALF) / side - ONE, tile_rows)
-        y1 = tile_index((high[1] + margin - HALF) / side, tile_rows)
-        polygons.margins[i] = margin
-        polygons.shapes[i] = wp.vec3i(count, wp.max(y0, 0), wp.min(y1, tile_rows - 1))
-
-    return tile_polygon
+            x = wp.where(k == 0 or k == 3, -real(HUGE), real(HUGE))
+            polygons.corners[i, k] = vec2(x, wp.where(k < 2, -real(HUGE), real(HUGE)))
+        polygons.shapes[i] = wp.vec3i(4, 0, tile_rows - 1)
+        return
+    # A corner is known to a rounding of the extent: pixels by the focal length over the depth.
+    diameter = wp.length(center) + wp.length(v1) + wp.length(v2)
+    blur = real(RELATIVE_MARGIN) * diameter * wp.max(intrinsics[0], intrinsics[1]) / nearest
+    margin = real(MARGIN) + real(RELATIVE_MARGIN) * size + blur
+    # A tile's samples are its pixel centres, half a pixel inside its border.
+    y0 = tile_index((low[1] - margin + HALF) / side - ONE, tile_rows)
+    y1 = tile_index((high[1] + margin - HALF) / side, tile_rows)
+    polygons.margins[i] = margin
+    polygons.shapes[i] = wp.vec3i(count, wp.max(y0, 0), wp.min(y1, tile_rows - 1))
 
 
 @wp.func

@@ -5,14 +5,14 @@ a hit at z-depth t the point origin + t * R^T d, and for a pixel the direction R
 SH; backward, the gradients of depths and, a pixel, of the matrix.
 """
 
-import functools
-from types import SimpleNamespace
+from __future__ import annotations
+
 from typing import Any
 
 import warp as wp
 
 from nexwarp.kernels.surfel import intrinsics_of, ray_through, rotate_back, translation
-from nexwarp.kernels.types import Mat33, Mat44, Vec3, types
+from nexwarp.kernels.types import Mat33, Mat44, Vec3, per_real
 
 
 @wp.func
@@ -41,65 +41,58 @@ def factor(factors: wp.array2d(dtype=Any), p: int, h: int):
     return factors.dtype(1.0)
 
 
-@functools.cache
-def unproject_kernels(real: type) -> SimpleNamespace:
-    """Make the kernel and its derivative."""
-    t = types(real)
-    vec3, mat33, mat44 = t.vec3, t.mat33, t.mat44
+@per_real()
+def unproject(
+    first: int,
+    depths: real_rows,
+    factors: real_rows,
+    viewmats: mat44s,
+    Ks: mat33s,
+    width: int,
+    # outputs
+    positions: vec3_rows,
+    directions: vec3s,
+):
+    p = first + wp.tid()
+    viewmat = viewmats[0]
+    ray = rotate_back(viewmat, ray_of(p, width, Ks[0]))
+    origin = -rotate_back(viewmat, translation(viewmat))
+    directions[p] = wp.normalize(ray)
+    for h in range(depths.shape[1]):
+        positions[p, h] = origin + ray * (depths[p, h] * factor(factors, p, h))
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def unproject(
-        first: wp.int32,
-        depths: wp.array2d(dtype=real),
-        factors: wp.array2d(dtype=real),
-        viewmats: wp.array(dtype=mat44),
-        Ks: wp.array(dtype=mat33),
-        width: wp.int32,
-        # outputs
-        positions: wp.array2d(dtype=vec3),
-        directions: wp.array(dtype=vec3),
-    ):
-        p = first + wp.tid()
-        viewmat = viewmats[0]
-        ray = rotate_back(viewmat, ray_of(p, width, Ks[0]))
-        origin = -rotate_back(viewmat, translation(viewmat))
-        directions[p] = wp.normalize(ray)
-        for h in range(depths.shape[1]):
-            positions[p, h] = origin + ray * (depths[p, h] * factor(factors, p, h))
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def unproject_backward(  # noqa: PLR0913  # a kernel entry point
-        first: wp.int32,
-        depths: wp.array2d(dtype=real),
-        factors: wp.array2d(dtype=real),
-        viewmats: wp.array(dtype=mat44),
-        Ks: wp.array(dtype=mat33),
-        width: wp.int32,
-        grad_positions: wp.array2d(dtype=vec3),
-        grad_directions: wp.array(dtype=vec3),
-        # outputs
-        grad_depths: wp.array2d(dtype=real),
-        grad_viewmats: wp.array(dtype=mat44),
-    ):
-        p = first + wp.tid()
-        viewmat = viewmats[0]
-        d = ray_of(p, width, Ks[0])
-        ray = rotate_back(viewmat, d)
-        grad_viewmat = mat44()
-        if grad_directions:
-            if grad_viewmats:
-                grad_viewmat, _r, _g = wp.grad(direction_dot)(viewmat, d, grad_directions[p])
-        for h in range(depths.shape[1]):
-            grad = vec3()
-            if grad_positions:
-                grad = grad_positions[p, h]
-            if grad_depths:
-                grad_depths[p, h] = wp.dot(ray, grad) * factor(factors, p, h)
-            if grad_viewmats:
-                point = d * (depths[p, h] * factor(factors, p, h))
-                of_position, _p, _h = wp.grad(position_dot)(viewmat, point, grad)
-                grad_viewmat += of_position
+@per_real()
+def unproject_backward(  # noqa: PLR0913  # a kernel entry point
+    first: int,
+    depths: real_rows,
+    factors: real_rows,
+    viewmats: mat44s,
+    Ks: mat33s,
+    width: int,
+    grad_positions: vec3_rows,
+    grad_directions: vec3s,
+    # outputs
+    grad_depths: real_rows,
+    grad_viewmats: mat44s,
+):
+    p = first + wp.tid()
+    viewmat = viewmats[0]
+    d = ray_of(p, width, Ks[0])
+    ray = rotate_back(viewmat, d)
+    grad_viewmat = mat44()
+    if grad_directions:
         if grad_viewmats:
-            grad_viewmats[p] = grad_viewmat
-
-    return SimpleNamespace(forward=unproject, backward=unproject_backward)
+            grad_viewmat, _r, _g = wp.grad(direction_dot)(viewmat, d, grad_directions[p])
+    for h in range(depths.shape[1]):
+        grad = vec3()
+        if grad_positions:
+            grad = grad_positions[p, h]
+        if grad_depths:
+            grad_depths[p, h] = wp.dot(ray, grad) * factor(factors, p, h)
+        if grad_viewmats:
+            point = d * (depths[p, h] * factor(factors, p, h))
+            of_position, _p, _h = wp.grad(position_dot)(viewmat, point, grad)
+            grad_viewmat += of_position
+    if grad_viewmats:
+        grad_viewmats[p] = grad_viewmat

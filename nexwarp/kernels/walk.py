@@ -36,7 +36,7 @@ def overflowed(lists: TileLists):
 
 # Returns a vector and takes `overflow`: with three results the backward pass needs 8 registers more (sm_90).
 @wp.func
-def walk(tile: wp.int32, lists: TileLists, overflow: wp.bool):
+def walk(tile: int, lists: TileLists, overflow: wp.bool):
     """(first place, end) of a tile's walk.
 
     The walk goes along the tile's list, or over all surfels where lists lack entries (overflow): lists only cull, so
@@ -48,7 +48,7 @@ def walk(tile: wp.int32, lists: TileLists, overflow: wp.bool):
 
 
 @wp.func
-def surfel_at(k: wp.int32, lists: TileLists, overflow: wp.bool):
+def surfel_at(k: int, lists: TileLists, overflow: wp.bool):
     """Surfel at place k of the walk."""
     if overflow:
         return lists.order[k]
@@ -112,7 +112,7 @@ def beside(side: Vec4, n: Vec4, facing: Real, reach: Real, d: Vec2, half: Vec2):
 
 
 @wp.func
-def misses_block(i: wp.int32, surfels: Surfels, d: Vec2, half: Vec2):
+def misses_block(i: int, surfels: Surfels, d: Vec2, half: Vec2):
     """Whether no ray of a block of pixels, d +- half, can hit a surfel. Only culls: conservative."""
     m = record_row(surfels.records, i, 3)[3]
     a = record_row(surfels.records, i, 0)
@@ -125,9 +125,7 @@ def misses_block(i: wp.int32, surfels: Surfels, d: Vec2, half: Vec2):
 
 
 @wp.func
-def candidate(
-    k: wp.int32, end: wp.int32, surfels: Surfels, lists: TileLists, overflow: wp.bool, middle: Vec2, half: Vec2
-):
+def candidate(k: int, end: int, surfels: Surfels, lists: TileLists, overflow: wp.bool, middle: Vec2, half: Vec2):
     """Surfel at place k of the walk; -1 behind its end, and on CUDA where the surfel misses the whole block."""
     i = int(-1)
     if k < end:
@@ -139,7 +137,7 @@ def candidate(
 
 
 @wp.func
-def stage(k: wp.int32, end: wp.int32, surfels: Surfels, lists: TileLists, overflow: wp.bool, middle: Vec2, half: Vec2):
+def stage(k: int, end: int, surfels: Surfels, lists: TileLists, overflow: wp.bool, middle: Vec2, half: Vec2):
     """(number of surfels staged, this lane's surfel): what `candidate` leaves of the lanes' places k."""
     i = candidate(k, end, surfels, lists, overflow, middle, half)
     chosen = ballot(wp.where(i >= 0, 1, 0))

@@ -49,14 +49,7 @@ def _access(real: type) -> wp.Function:
 
     @wp.func_native(snippet(_ROW.replace("REAL", kind).replace("BLOCK_DIM", str(BLOCK_DIM)), _ROW_ITSELF))
     def access_row(
-        step: wp.int32,
-        slot: wp.int32,
-        a: vec4,
-        b: vec4,
-        n: vec4,
-        c: vec4,
-        records: wp.array2d(dtype=vec4),
-        i: wp.int32,
+        step: wp.int32, slot: wp.int32, a: vec4, b: vec4, n: vec4, c: vec4, records: wp.array2d(dtype=vec4), i: wp.int32
     ) -> vec4: ...
 
     return access_row

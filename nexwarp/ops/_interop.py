@@ -75,9 +75,9 @@ def needed(grads: Sequence[torch.Tensor | None], needs: Sequence[bool]) -> tuple
     return tuple(x if need else None for x, need in zip(grads, needs, strict=True))
 
 
-def contiguous(*tensors: torch.Tensor | None) -> list[torch.Tensor | None]:
+def contiguous(*tensors: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
     """The tensors, each contiguous; None stays None."""
-    return [None if x is None else x.contiguous() for x in tensors]
+    return tuple(None if x is None else x.contiguous() for x in tensors)
 
 
 def real_of(tensor: torch.Tensor) -> type:
@@ -124,12 +124,14 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
     return view
 
 
-# What a kernel or a struct declares: an array's elements, and the dimensions of a tensor that holds it; else None.
-Declared: TypeAlias = tuple[type, int] | None
+# What a kernel or a struct declares: an array's elements, and the dimensions of a tensor that holds it; or a struct.
+Declared: TypeAlias = Any
 
 
-def _declared(kind: object) -> Declared:
-    return (kind.dtype, kind.ndim + len(getattr(kind.dtype, "_shape_", ()))) if isinstance(kind, wp.array) else None
+def _declared(kind: WarpObject) -> Declared:
+    if isinstance(kind, wp.array):
+        return kind.dtype, kind.ndim + len(getattr(kind.dtype, "_shape_", ()))
+    return kind if hasattr(kind, "ctype") else None
 
 
 @functools.cache
@@ -143,7 +145,14 @@ def _fields_of(kind: WarpObject) -> dict[str, Declared]:
 
 
 def _as_declared(value: Argument, declared: Declared) -> Argument:
-    """View a tensor as an array: dimensions in front of the array's own become one, or are added."""
+    """View a tensor as an array: dimensions in front of the array's own become one, or are added.
+
+    A tuple becomes a struct whose first fields it has, a dictionary one of values by name; other arrays are null.
+    """
+    if isinstance(value, tuple):
+        value = dict(zip(declared.vars, value, strict=False))
+    if isinstance(value, dict):
+        return struct(declared, **value)
     if declared is None or not isinstance(value, torch.Tensor):
         return value
     dtype, own = declared
@@ -253,7 +262,7 @@ if hasattr(os, "register_at_fork"):
 
 def launch(
     like: torch.Tensor,
-    kernel: wp.Kernel,
+    kernel: wp.Kernel | Callable[[type], wp.Kernel],
     dim: int | tuple[int, int],
     inputs: Sequence[Argument],
     outputs: Sequence[Argument],
@@ -263,8 +272,10 @@ def launch(
 ) -> None:
     """Launch on the device and current stream of `like`; see `nexwarp.kernels.launch.launch`.
 
-    Tensors become arrays of the types that the kernel declares, see `_as_declared`.
+    A kernel for each scalar type is that of the type of `like`. Tensors become arrays, and tuples and dictionaries
+    structs, of the types that the kernel declares, see `_as_declared`.
     """
+    kernel = kernel if isinstance(kernel, wp.Kernel) else kernel(real_of(like))
     arguments = [_as_declared(x, kind) for x, kind in zip((*inputs, *outputs), _arguments_of(kernel), strict=True)]
     device, stream = device_of(like), stream_of(like)
     launching.launch(kernel, dim, arguments, device=device, stream=stream, block_dim=block_dim, sharing=sharing)

@@ -3,9 +3,8 @@
 import torch
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.activate import activate_kernels
-from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Argument, Context, first_derivative, launch, needed, real_of, struct
+from nexwarp.kernels import activate as kernels
+from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, needed
 
 
 def activate(
@@ -25,30 +24,18 @@ def activate(
     return _Activate.apply(*(x.contiguous() for x in raw))
 
 
-def parameters(
-    quats: torch.Tensor | None, scales: torch.Tensor, opacities: torch.Tensor, gammas: torch.Tensor
-) -> Argument:
-    """The struct `Parameters` of the kernels."""
-    scales, opacities, gammas = (x.contiguous() for x in (scales, opacities, gammas))
-    kind = types(real_of(scales)).Parameters
-    return struct(kind, quats=quats, scales=scales, opacities=opacities, gammas=gammas)
-
-
 class _Activate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Context, *raw: torch.Tensor) -> tuple[torch.Tensor, ...]:
         activated = tuple(torch.empty_like(x) for x in raw)
-        kernel = activate_kernels(real_of(raw[0])).forward
-        launch(raw[0], kernel, len(raw[0]), [parameters(*raw)], [parameters(*activated)])
+        launch(raw[0], kernels.activate, len(raw[0]), [raw], [activated])
         ctx.save_for_backward(*raw)
         return activated
 
     @staticmethod
     @first_derivative
-    def backward(ctx: Context, grad_quats: torch.Tensor, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         raw = ctx.saved_tensors
-        grad_raw = [torch.empty_like(x) for x in raw]
-        inputs = [parameters(*raw), parameters(grad_quats.contiguous(), *grads)]
-        kernel = activate_kernels(real_of(raw[0])).backward
-        launch(raw[0], kernel, len(raw[0]), inputs, [parameters(*grad_raw)])
+        grad_raw = tuple(torch.empty_like(x) for x in raw)
+        launch(raw[0], kernels.activate_backward, len(raw[0]), [raw, contiguous(*grads)], [grad_raw])
         return needed(grad_raw, ctx.needs_input_grad)

@@ -2,8 +2,8 @@
 
 import torch
 
-from nexwarp.kernels.compose import compose_kernels
-from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, real_of
+from nexwarp.kernels import compose as kernels
+from nexwarp.ops._interop import Context, contiguous, first_derivative, launch
 
 
 def compose(
@@ -24,18 +24,10 @@ def compose(
 
 class _Compose(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Context,
-        plain: torch.Tensor,
-        base: torch.Tensor | None,
-        colors: torch.Tensor,
-        weights: torch.Tensor,
-        alpha: torch.Tensor,
-        background: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(ctx: Context, plain: torch.Tensor, *rest: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        _base, colors, weights, alpha, background = rest
         image, textured = torch.empty_like(plain), torch.empty_like(plain)
-        inputs = [plain, base, colors, weights, alpha, background]
-        launch(plain, compose_kernels(real_of(plain)).forward, alpha.numel(), inputs, [image, textured])
+        launch(plain, kernels.compose, alpha.numel(), [(plain, *rest)], [image, textured])
         ctx.save_for_backward(colors, weights, alpha, background)
         ctx.set_materialize_grads(False)
         return image, textured
@@ -51,8 +43,8 @@ class _Compose(torch.autograd.Function):
         need_plain, *needed, need_background = ctx.needs_input_grad
         shapes = ((*alpha.shape, 3), colors.shape, weights.shape, alpha.shape)
         grads = [weights.new_empty(s) if need else None for s, need in zip(shapes, needed, strict=True)]
-        inputs = [colors, weights, background, *contiguous(grad_image, grad_textured)]
-        launch(weights, compose_kernels(real_of(weights)).backward, alpha.numel(), inputs, grads)
+        inputs = [(None, None, colors, weights, None, background), *contiguous(grad_image, grad_textured)]
+        launch(weights, kernels.compose_backward, alpha.numel(), inputs, [(None, *grads)])
         plain = grad_image if need_plain else None
         # One colour for all pixels: torch's sum instead of every thread adding to one place.
         if not need_background or grad_image is None:

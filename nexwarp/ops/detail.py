@@ -3,9 +3,8 @@
 import torch
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.detail import antialias_kernels, limit_depths_kernel
-from nexwarp.ops._interop import Context, first_derivative, launch, needed, real_of
-from nexwarp.ops.activate import parameters
+from nexwarp.kernels import detail as kernels
+from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, needed
 
 
 def antialias(
@@ -42,9 +41,8 @@ class _Antialias(torch.autograd.Function):
         ctx: Context, farthest: torch.Tensor, focal: torch.Tensor, depths: torch.Tensor, *shape: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
         blurred = tuple(torch.empty_like(x) for x in shape)
-        inputs = [depths, parameters(None, *shape), farthest, focal]
-        kernel = antialias_kernels(real_of(farthest)).forward
-        launch(farthest, kernel, len(farthest), inputs, [parameters(None, *blurred)])
+        inputs = [depths, (None, *shape), farthest, focal]
+        launch(farthest, kernels.antialias, len(farthest), inputs, [(None, *blurred)])
         ctx.save_for_backward(farthest, focal, depths, *shape)
         return blurred
 
@@ -53,9 +51,8 @@ class _Antialias(torch.autograd.Function):
     def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         farthest, focal, depths, *shape = ctx.saved_tensors
         grad_depths, *grad_shape = (torch.empty_like(x) for x in (depths, *shape))
-        inputs = [depths, parameters(None, *shape), farthest, focal, parameters(None, *grads)]
-        kernel = antialias_kernels(real_of(farthest)).backward
-        launch(farthest, kernel, len(farthest), inputs, [grad_depths, parameters(None, *grad_shape)])
+        inputs = [depths, (None, *shape), farthest, focal, contiguous(None, *grads)]
+        launch(farthest, kernels.antialias_backward, len(farthest), inputs, [grad_depths, (None, *grad_shape)])
         return needed((None, None, grad_depths, *grad_shape), ctx.needs_input_grad)
 
 
@@ -79,8 +76,7 @@ class _LimitDepths(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Context, ids: torch.Tensor, depths: torch.Tensor, *limits: torch.Tensor) -> torch.Tensor:
         limited = torch.empty_like(depths)
-        kernel = limit_depths_kernel(real_of(depths))
-        launch(depths, kernel, depths.numel(), [ids, depths, *limits], [limited])
+        launch(depths, kernels.limit_depths, depths.numel(), [ids, depths, *limits], [limited])
         ctx.save_for_backward(depths, limited)
         return limited
 

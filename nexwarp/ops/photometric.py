@@ -5,7 +5,7 @@ import math
 import torch
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.photometric import depth_kernels, expose_kernels, photometric_kernels
+from nexwarp.kernels import photometric as kernels
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, needed, real_of
 
@@ -62,7 +62,7 @@ class _Photometric(torch.autograd.Function):
         real, pixels = real_of(like), like.shape[0] * like.shape[1]
         scales = types(real).vec3(factors[0] / (3 * pixels), factors[1] / (3 * pixels), factors[2] / pixels)
         sums, threads = _warp_sums(like, 3, pixels)
-        launch(like, photometric_kernels(real).forward, threads, [*tensors, scales, saturation, pixels], [sums])
+        launch(like, kernels.photometric, threads, [tensors, scales, saturation, pixels], [sums])
         ctx.save_for_backward(*tensors)
         ctx.rest = scales, saturation
         ctx.set_materialize_grads(False)
@@ -76,8 +76,8 @@ class _Photometric(torch.autograd.Function):
         l1, texture, alpha = (grad is not None for grad in grads)
         reached = zip(tensors, ctx.needs_input_grad[2:], (l1, texture, texture or alpha, False), strict=True)
         results = [torch.empty_like(x) if needed and term else None for x, needed, term in reached]
-        kernel = photometric_kernels(real_of(like)).backward
-        launch(like, kernel, like.shape[0] * like.shape[1], [*tensors, *ctx.rest, *grads], results[:3])
+        inputs, pixels = [tensors, *ctx.rest, *grads], like.shape[0] * like.shape[1]
+        launch(like, kernels.photometric_backward, pixels, inputs, [tuple(results)])
         return None, None, *results
 
 
@@ -111,8 +111,7 @@ class _Expose(torch.autograd.Function):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         exposed, exposed_colors = torch.empty_like(image), torch.empty_like(textured)
         inputs = [image, textured, exposure, photo, saturation]
-        kernel = expose_kernels(real_of(image)).forward
-        launch(image, kernel, photo.numel() // 3, inputs, [exposed, exposed_colors])
+        launch(image, kernels.expose, photo.numel() // 3, inputs, [exposed, exposed_colors])
         ctx.save_for_backward(image, exposure, photo)
         ctx.rest = saturation
         ctx.set_materialize_grads(False)
@@ -127,7 +126,7 @@ class _Expose(torch.autograd.Function):
         grads = contiguous(grad_exposed, grad_exposed_colors)
         results = [None if x is None else torch.empty_like(x) for x in grads]
         inputs = [image, exposure, photo, ctx.rest, *grads]
-        launch(image, expose_kernels(real_of(image)).backward, photo.numel() // 3, inputs, results)
+        launch(image, kernels.expose_backward, photo.numel() // 3, inputs, results)
         return *results, None, None, None
 
 
@@ -169,7 +168,7 @@ class _DepthTerm(torch.autograd.Function):
     ) -> torch.Tensor:
         sums, threads = _warp_sums(depths, 2, expected.numel())
         inputs = [depths, weights, expected, places, factor]
-        launch(depths, depth_kernels(real_of(depths)).forward, threads, inputs, [sums])
+        launch(depths, kernels.depth_errors, threads, inputs, [sums])
         totals = sums.sum(1)
         ctx.save_for_backward(depths, weights, expected, places, totals)
         ctx.rest = factor
@@ -180,6 +179,6 @@ class _DepthTerm(torch.autograd.Function):
     def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         *tensors, totals = ctx.saved_tensors
         grads = [torch.empty_like(x) for x in tensors[:2]]
-        kernel, pixels = depth_kernels(real_of(totals)).backward, grads[0].shape[0] * grads[0].shape[1]
-        launch(totals, kernel, pixels, [*tensors, ctx.rest, totals, grad], grads)
+        inputs, pixels = [*tensors, ctx.rest, totals, grad], grads[0].shape[0] * grads[0].shape[1]
+        launch(totals, kernels.depth_errors_backward, pixels, inputs, grads)
         return (*needed(grads, ctx.needs_input_grad[:2]), None, None, None)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.project import project_kernels
-from nexwarp.ops._interop import Context, first_derivative, launch, needed, real_of
+from nexwarp.kernels import project as kernels
+from nexwarp.ops._interop import Context, first_derivative, launch, needed
 
 # Shapes of activated surfels, as `errors.check_tensors` takes them.
 GEOMETRY: dict[str, tuple[int | str, ...]] = {
@@ -60,12 +60,12 @@ def project(
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Context, *inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        means = inputs[0]
+        means, *shape, colors, viewmat = inputs
         records = means.new_empty(len(means), 4, 4)
         centers = torch.empty_like(means)
         limits = means.new_empty(len(means))
-        launch(means, project_kernels(real_of(means)).forward, len(means), inputs, [records, centers, limits])
-        ctx.save_for_backward(*inputs[:3], inputs[6])
+        launch(means, kernels.project, len(means), [(*shape, means, colors), viewmat], [records, centers, limits])
+        ctx.save_for_backward(means, *shape[:2], viewmat)
         ctx.mark_non_differentiable(centers, limits)
         ctx.set_materialize_grads(False)
         return records, centers, limits
@@ -79,11 +79,12 @@ class _Project(torch.autograd.Function):
             return (None,) * 7
         means, quats, scales, viewmat = ctx.saved_tensors
         count = len(means)
-        grads = [torch.empty_like(x) for x in (means, quats, scales)]
-        grads += [means.new_empty(count), torch.empty_like(scales), torch.empty_like(means)]
+        grad_means, grad_colors = torch.empty_like(means), torch.empty_like(means)
+        grads = (torch.empty_like(quats), torch.empty_like(scales), means.new_empty(count), torch.empty_like(scales))
         # A slot a surfel, then one sum: no contention, and a fixed order.
         grad_viewmats = viewmat.new_empty(count, 4, 4) if ctx.needs_input_grad[6] else None
-        inputs = [means, quats, scales, viewmat, grad_records.contiguous()]
-        launch(means, project_kernels(real_of(means)).backward, count, inputs, [*grads, grad_viewmats])
+        inputs = [(quats, scales, None, None, means), viewmat, grad_records.contiguous()]
+        outputs = [(*grads, grad_means, grad_colors), grad_viewmats]
+        launch(means, kernels.project_backward, count, inputs, outputs)
         grad_viewmat = None if grad_viewmats is None else grad_viewmats.sum(0)
-        return needed([*grads, grad_viewmat], ctx.needs_input_grad)
+        return needed([grad_means, *grads, grad_colors, grad_viewmat], ctx.needs_input_grad)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 
-from nexwarp.kernels.surface import surface_kernel
+from nexwarp.kernels import surface as kernels
 from nexwarp.kernels.surface_backward import surface_backward_kernel
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import Context, first_derivative, struct
@@ -66,7 +66,7 @@ class _Surface(torch.autograd.Function):
             ctx.rest = scene
         written = {"expected": expected, "median": median, "top": top, "normals": normals}
         outputs = struct(types(scene.real).Surface, **written, totals=totals, picks=picks)
-        scene.launch(surface_kernel(scene.real), [stops, outputs])
+        scene.launch(kernels.surface(scene.real), [stops, outputs])
         return expected, median, top, normals
 
     @staticmethod

@@ -7,19 +7,11 @@ from typing import Literal, get_args
 import torch
 import warp as wp
 
+from nexwarp.kernels import tile_lists as kernels
 from nexwarp.kernels.launch import UNEVEN
-from nexwarp.kernels.tile_lists import (
-    count_kernel,
-    depth_keys_kernel,
-    emit_kernel,
-    list_threads,
-    surfel_ids_kernel,
-    tile_offsets_kernel,
-)
-from nexwarp.kernels.tiles import LARGEST_INT, MAX_CORNERS, MAX_ENTRIES, tile_polygon_kernel
-from nexwarp.kernels.types import types
+from nexwarp.kernels.tiles import LARGEST_INT, MAX_CORNERS, MAX_ENTRIES, tile_polygon
 from nexwarp.native.warp import tile_size_on
-from nexwarp.ops._interop import Argument, launch, real_of, stream_of, struct, warp_array, warp_streams
+from nexwarp.ops._interop import launch, stream_of, warp_array, warp_streams
 from nexwarp.ops.memory import check_memory
 from nexwarp.ops.project import Pinhole, Projection
 
@@ -90,17 +82,19 @@ def intersect_tiles(
         ValueError, OutOfMemoryError: there are more than MAX_ENTRIES entries, or more than memory holds; on CUDA only
             when that is noticed without a wait.
     """
-    tensors = [x.detach().contiguous() for x in surfels]
-    means = tensors[0]
-    real, count = real_of(means), len(means)
+    means, *shape = (x.detach().contiguous() for x in surfels)
+    count = len(means)
     side = tile_size_on(means.is_cuda)
     kind = columns, rows = -(-camera.width // side), -(-camera.height // side)
     order = _depth_order(projection.centers.detach(), blending)
-    polygons, reaches = _tile_polygons(tensors, viewmat, camera, rows)
+    corners, margins, reaches = (means.new_empty(count, *x) for x in ((MAX_CORNERS, 2), (), (2,)))
+    polygons = (corners, order.new_empty(count, 3), margins)
+    inputs = [(*shape, means), viewmat.contiguous(), camera.K.contiguous(), camera.near, rows]
+    launch(means, tile_polygon, count, inputs, [reaches, polygons])
     arguments = [order, polygons, wp.vec2i(columns, rows)]
-    threads = list_threads(count, means.is_cuda)
+    threads = kernels.list_threads(count, means.is_cuda)
     totals, ends = (torch.empty(count, dtype=x, device=means.device) for x in (torch.int64, torch.int32))
-    launch(means, count_kernel(real), threads, arguments, [totals], sharing=UNEVEN)
+    launch(means, kernels.count, threads, arguments, [totals], sharing=UNEVEN)
     _scan(totals)
     learns = room is None and means.is_cuda
     exact = room is None and not learns
@@ -111,7 +105,7 @@ def intersect_tiles(
     # Sums on a CPU need to know each entry's emission index; elsewhere the surfels themselves are sorted.
     surfel_of = ends.new_empty(room) if exact else None
     emission, lists = [*arguments, totals, threads, columns * rows], [ends, tile_ids[:room], values[:room], surfel_of]
-    launch(means, emit_kernel(real), threads, emission, lists, sharing=UNEVEN)
+    launch(means, kernels.emit, threads, emission, lists, sharing=UNEVEN)
     if not threads:
         values[:room] = 0
         tile_ids[:room] = columns * rows
@@ -121,28 +115,10 @@ def intersect_tiles(
     surfel_ids, entries = values[:room], values[:0]
     if exact:
         surfel_ids, entries = ends.new_empty(room), values[:room]
-        launch(means, surfel_ids_kernel, room, [entries, surfel_of], [surfel_ids])
+        launch(means, kernels.surfel_ids, room, [entries, surfel_of], [surfel_ids])
     offsets = order.new_empty(columns * rows + 1)
-    launch(means, tile_offsets_kernel, len(offsets), [tile_ids[:room], room], [offsets])
+    launch(means, kernels.tile_offsets, len(offsets), [tile_ids[:room], room], [offsets])
     return Tiles(order, ends, surfel_ids, entries, offsets, reaches, columns, exact, kind)
-
-
-def _tile_polygons(
-    shape: list[torch.Tensor], viewmat: torch.Tensor, camera: Pinhole, rows: int
-) -> tuple[Argument, torch.Tensor]:
-    """The tile polygons, as counting and emitting read them, and `Tiles.reaches`."""
-    like, count = shape[0], len(shape[0])
-    real = real_of(like)
-    reaches = like.new_empty(count, 2)
-    polygons = struct(
-        types(real).Polygons,
-        corners=like.new_empty(count, MAX_CORNERS, 2),
-        shapes=torch.empty(count, 3, dtype=torch.int32, device=like.device),
-        margins=like.new_empty(count),
-    )
-    inputs = [*shape, viewmat.contiguous(), camera.K.contiguous(), camera.near, rows]
-    launch(like, tile_polygon_kernel(real), count, inputs, [reaches, polygons])
-    return polygons, reaches
 
 
 def _depth_order(centers: torch.Tensor, blending: Order) -> torch.Tensor:
@@ -151,7 +127,7 @@ def _depth_order(centers: torch.Tensor, blending: Order) -> torch.Tensor:
         centers = torch.cat([centers[:, :2], centers.norm(dim=-1, keepdim=True)], dim=-1)
     count = len(centers)
     keys, order = (torch.empty(2 * count, dtype=torch.int32, device=centers.device) for _ in range(2))
-    launch(centers, depth_keys_kernel(real_of(centers)), count, [centers.contiguous()], [keys, order])
+    launch(centers, kernels.depth_keys, count, [centers.contiguous()], [keys, order])
     _sort(keys, order, count, 32)
     return order[:count]
 

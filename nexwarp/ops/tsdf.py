@@ -5,8 +5,7 @@ import warp as wp
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.tsdf import BLOCK_SIDE, fuse_kernel
-from nexwarp.kernels.types import types
+from nexwarp.kernels.tsdf import BLOCK_SIDE, fuse
 from nexwarp.ops._interop import launch
 from nexwarp.ops.memory import check_memory
 
@@ -71,13 +70,13 @@ class DistanceField:
             self.voxel,
             self.truncation,
             camera.viewmat.contiguous(),
-            types(wp.float32).vec4(camera.fx, camera.fy, camera.cx, camera.cy),
+            wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy),
             wp.vec2i(camera.width, camera.height),
             camera.near,
             depths.contiguous(),
             colors.contiguous(),
         ]
-        launch(depths, fuse_kernel(), self.distances.numel(), inputs, [self.distances, self.weights, self.means])
+        launch(depths, fuse, self.distances.numel(), inputs, [self.distances, self.weights, self.means])
 
     def neighbors(self, offset: tuple[int, int, int]) -> torch.Tensor:
         """Return the index (B,) of each block's neighbour at an offset in blocks; B where there is none."""

@@ -2,8 +2,8 @@
 
 import torch
 
-from nexwarp.kernels.unproject import unproject_kernels
-from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, real_of
+from nexwarp.kernels import unproject as kernels
+from nexwarp.ops._interop import Context, contiguous, first_derivative, launch
 from nexwarp.ops.project import Pinhole
 
 
@@ -27,7 +27,7 @@ class _Unproject(torch.autograd.Function):
         directions = depths.new_empty(*depths.shape[:2], 3)
         inputs = [depths, factors, viewmat, camera.K.contiguous(), camera.width]
         pixels = depths.shape[0] * depths.shape[1]
-        launch(depths, unproject_kernels(real_of(depths)).forward, pixels, inputs, [positions, directions])
+        launch(depths, kernels.unproject, pixels, inputs, [positions, directions])
         ctx.save_for_backward(depths, factors, viewmat)
         ctx.rest = camera
         ctx.set_materialize_grads(False)
@@ -53,6 +53,5 @@ class _Unproject(torch.autograd.Function):
             grad_positions = grad_positions.contiguous()
         arguments = [depths, factors, viewmat, camera.K.contiguous(), camera.width]
         inputs = [*arguments, grad_positions, *contiguous(grad_directions)]
-        kernel = unproject_kernels(real_of(depths)).backward
-        launch(depths, kernel, pixels, inputs, [grad_depths, grad_viewmats])
+        launch(depths, kernels.unproject_backward, pixels, inputs, [grad_depths, grad_viewmats])
         return grad_depths, None if grad_viewmats is None else grad_viewmats.sum(0), None, None
