@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import torch
 
-from nexwarp.errors import check_range
+from nexwarp.errors import check_finite, check_range, check_tensors
 
 Array: TypeAlias = torch.Tensor | np.ndarray
 
@@ -202,25 +202,15 @@ def _as_tensor(name: str, value: object, device: torch.device | None) -> torch.T
     return torch.tensor(numbers, dtype=torch.float32, device=device)
 
 
-def _matrix(name: str, tensor: torch.Tensor, size: int) -> torch.Tensor:
-    """Check a finite floating (size, size) tensor and return it as float64 on the CPU."""
-    if not tensor.is_floating_point():
-        raise TypeError(f"{name}: expected a floating dtype, got {tensor.dtype}")
-    if tensor.shape != (size, size):
-        raise ValueError(f"{name}: expected shape ({size}, {size}), got {tuple(tensor.shape)}")
-    matrix = tensor.detach().double().cpu()
-    if not bool(torch.isfinite(matrix).all()):
-        raise ValueError(f"{name}: expected finite values, got {matrix.tolist()}")
-    return matrix
-
-
 def _check(
     viewmat: torch.Tensor, K: torch.Tensor, sides: dict[str, int], near: float
 ) -> tuple[float, float, float, float]:
     """Return fx, fy, cx and cy; raise TypeError or ValueError where a field of a camera does not fit."""
-    pose, intrinsics = _matrix("viewmat", viewmat, 4), _matrix("K", K, 3)
-    if K.device != viewmat.device:
-        raise ValueError(f"K: expected a tensor on {viewmat.device} as viewmat is, got one on {K.device}")
+    check_tensors({"viewmat": (viewmat, (4, 4))})
+    check_tensors({"K": (K, (3, 3))}, device=viewmat.device)
+    pose, intrinsics = viewmat.detach().double().cpu(), K.detach().double().cpu()
+    check_finite("viewmat", pose)
+    check_finite("K", intrinsics)
     for name, value in sides.items():
         if isinstance(value, bool) or not isinstance(value, int):
             raise TypeError(f"{name}: expected an int, got {type(value).__name__}")

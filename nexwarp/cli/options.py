@@ -14,7 +14,6 @@ from nexwarp.cli import __version__
 from nexwarp.data.option import option
 from nexwarp.errors import RankError, SettingError
 from nexwarp.kernels.launch import get_num_threads, set_num_threads
-from nexwarp.kernels.types import MAX_HITS
 from nexwarp.train.ranks.ranks import Ranks, is_rank
 
 Run_ = Annotated[Path, tyro.conf.Positional, option("RUN")]
@@ -22,12 +21,6 @@ Device_ = Annotated[str | None, option("{cuda,cpu}", "cuda if there is one")]
 Preset_ = Annotated[str, option("NAME")]
 Port_ = Annotated[int, option("PORT")]
 Host_ = Annotated[str, option("ADDRESS")]
-
-
-def check_max_hits(max_hits: int | None) -> None:
-    """Raise SettingError unless --max-hits is in range."""
-    if max_hits is not None and not 0 <= max_hits <= MAX_HITS:
-        raise SettingError(f"--max-hits: expected 0 to {MAX_HITS}, got {max_hits}")
 
 
 def pick_device(name: str | None) -> torch.device:

@@ -15,7 +15,7 @@ from rich.console import Console
 from nexwarp.cli import display
 from nexwarp.cli.commands import make_scene, needs_cameras, print_url, scene_folder_of, show_until_interrupted
 from nexwarp.cli.display import device_name
-from nexwarp.cli.options import Device_, Host_, Port_, Preset_, check_max_hits, joined_ranks
+from nexwarp.cli.options import Device_, Host_, Port_, Preset_, joined_ranks
 from nexwarp.cli.session import Session
 from nexwarp.data import Scene
 from nexwarp.data.option import Flag_, option
@@ -216,7 +216,6 @@ class Train:
 
     def _settings(self) -> tuple[dict[str, Json], dict[str, Json]]:
         """Return the settings that are given as options of their own, and those of --set, which must be others."""
-        check_max_hits(self.max_hits)
         flags: dict[str, Json] = {
             "iterations": self.iterations,
             "max_surfels": self.max_surfels,

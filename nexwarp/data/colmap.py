@@ -1,8 +1,7 @@
 """COLMAP models, binary and text: search for their files, and conversion of their records to photos and points.
 
-pycolmap's reader is not used: it allocates memory for a count before it checks the file's size, reads past the end of
-a truncated file, aborts the process on some damaged files, and creates a Python object for each point. Rigs and frames,
-which repeat the poses of the images, are not read.
+pycolmap's reader allocates memory for a count before it checks the file's size, and aborts the process on some damaged
+files. Rigs and frames, which repeat the poses of the images, are not read.
 """
 
 import codecs

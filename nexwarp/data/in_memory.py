@@ -11,6 +11,7 @@ from nexwarp.cameras.camera import Array, Camera
 from nexwarp.cameras.cameras_file import WORLD
 from nexwarp.data.capture import LARGEST_COORDINATE, LOST_PIXELS, Cloud, far_origin, safe_name
 from nexwarp.data.views import View
+from nexwarp.errors import check_range, check_tensors, check_values
 
 
 def split_views(
@@ -49,14 +50,9 @@ def split_views(
 def make_cloud(points: Array, colors: Array | None) -> Cloud:
     """Make a point cloud of the arguments of `Scene.from_tensors`."""
     positions = _tensor("points", points)
-    if not positions.is_floating_point():
-        raise TypeError(f"points: expected a floating dtype, got {positions.dtype}")
-    if positions.ndim != 2 or positions.shape[1] != 3 or not len(positions):
-        raise ValueError(f"points: expected shape (P, 3) with P at least 1, got {tuple(positions.shape)}")
-    bad = (~(positions.abs() <= LARGEST_COORDINATE)).any(dim=1).nonzero()
-    if len(bad):
-        index = int(bad[0])
-        raise ValueError(f"points[{index}]: expected finite coordinates, got {tuple(positions[index].tolist())}")
+    check_tensors({"points": (positions, ("P", 3))})
+    check_range("points: number", len(positions), 1)
+    check_values("points", positions, -LARGEST_COORDINATE, LARGEST_COORDINATE)
     if colors is None:
         raise ValueError(f"colors: expected one for each of {len(positions)} points, got None")
     values = as_bytes("colors", colors)

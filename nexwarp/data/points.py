@@ -44,11 +44,7 @@ def initial_points(
     errors: torch.Tensor | None = None,
     filter_outliers: bool = True,
 ) -> InitialPoints:
-    """Choose the initial points of a training.
-
-    The scale of a point is half the root mean square distance to its 3 nearest predecessors in the order of the
-    sampling. The first three points use their nearest points among all chosen ones. Points at the same position count
-    once.
+    """Choose the initial points of a training; points at the same position count once.
 
     Args:
         points: (P, 3) float, world frame, finite; at least one.
@@ -58,9 +54,6 @@ def initial_points(
         errors: (P,) float, mean reprojection errors in pixels; negative if unknown.
         filter_outliers: drop points seen in fewer than 3 photos or with an error above median + 3 robust
             sigmas, as far as `track_lengths` and `errors` are given; at most half of the points.
-
-    Returns:
-        min(count, available) points.
     """
     xyz = points.detach().cpu().double().numpy()
     srgb = colors.detach().cpu()

@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
+from nexwarp.cameras.camera import in_image
 from nexwarp.data.capture import Cloud
 from nexwarp.data.views import View
 
@@ -91,14 +93,10 @@ def _plausible(judges: Sequence[View], points: np.ndarray, least: int) -> np.nda
     empty = np.zeros(len(points), bool)
     for view in judges:
         camera = view.camera
-        local = points @ camera.viewmat[:3, :3].numpy().T + camera.viewmat[:3, 3].numpy()
-        ahead = local[:, 2] > camera.near
-        depth = np.where(ahead, local[:, 2], 1.0)
-        x = local[:, 0] / depth * camera.fx + camera.cx
-        y = local[:, 1] / depth * camera.fy + camera.cy
-        inside = ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-        seen += inside
+        pixels, depths = camera.to(torch.float64).project(torch.from_numpy(points))
+        inside = in_image(pixels, depths, camera.width, camera.height) & (depths > camera.near)
+        seen += inside.numpy()
         if view.alpha is not None:
-            alpha = view.alpha.numpy()[y[inside].astype(int), x[inside].astype(int)]
-            empty[np.flatnonzero(inside)[alpha == 0]] = True
+            column, row = pixels[inside].long().unbind(1)
+            empty[inside.numpy()] |= (view.alpha[row, column] == 0).numpy()
     return (seen >= least) & ~empty

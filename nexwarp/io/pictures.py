@@ -32,9 +32,7 @@ MOST_HELD = 2**29  # values of the pictures that wait
 def to_uint8(image: torch.Tensor) -> torch.Tensor:
     """Clamp a float image to [0, 1] and round it to uint8; a uint8 image is returned unchanged.
 
-    Raises:
-        TypeError: `image` is neither uint8 nor floating.
-        ValueError: `image` holds NaN or infinity.
+    TypeError: it is neither uint8 nor floating. ValueError: it holds NaN or infinity.
     """
     if image.dtype == torch.uint8:
         return image
@@ -45,11 +43,7 @@ def to_uint8(image: torch.Tensor) -> torch.Tensor:
 
 
 def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
-    """Write an (H, W, 3) image, uint8 or float in [0, 1], as a PNG file, atomically; missing folders are created.
-
-    Raises:
-        TypeError, ValueError: `image` has another dtype or shape; OSError: `path` cannot be written.
-    """
+    """Write an (H, W, 3) image, uint8 or float in [0, 1], as a PNG file, atomically; missing folders are created."""
     _write(path, _encoded(_shown("image", image).numpy(), **PNG))
 
 

@@ -15,13 +15,7 @@ def write_elements(
 ) -> None:
     """Write a binary little-endian PLY file, atomically.
 
-    Args:
-        path: the file.
-        elements: columns by name, for each element; (N,), or (N, k) for a property that is a list of k values.
-        comment: of the header; "" has none.
-
-    Raises:
-        OSError: `path` cannot be written.
+    Each element has columns by name: (N,), or (N, k) for a property that is a list of k values.
     """
     header = ["ply", "format binary_little_endian 1.0", *([f"comment {comment}"] if comment else [])]
     bodies = []

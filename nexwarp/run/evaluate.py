@@ -61,10 +61,10 @@ def evaluate(
     progress: Callable[[str], None] | None = None,
     ranks: Ranks | None = None,
 ) -> Evaluation:
-    """Render views and compare them with their photos.
+    """Render views, on the model's device, and compare them with their photos.
 
     Args:
-        model: the model, on the device to render on.
+        model: what is rendered.
         views: held-out views.
         renders: folder for the images: `test/` gets each rendering, `compare/` a strip of photo, rendering and error
             map. None writes nothing.

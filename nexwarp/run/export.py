@@ -56,6 +56,12 @@ RENDERED = ("mesh", "web", "glb", "usd")  # formats that are made of renderings,
 CARDS = ("glb", "usd")  # formats for other programs, whose scenes have objects
 BAKED = ("web", *CARDS)  # formats whose texture is baked, and fitted to photos
 READ = ("web", "glb")  # of these, those that can be read back
+# Options of one format.
+OPTIONS = {
+    "mesh": ("voxel", "far"),
+    "usd": ("collision",),
+    "web": ("title", "caption", "background", "annotations", "url"),
+}
 Figures = dict[str, dict[str, float]]  # metrics on test views, of what was baked and of the model
 GREY_LEVEL = 1 / 255
 COLLISION_VOXELS = 48  # along the scene's longest side
@@ -112,14 +118,10 @@ class ExportOrder:
             raise SettingError(f"--format: expected one of {', '.join(EXPORTS)}, got {self.format!r}")
         if self.alpha not in ALPHAS:
             raise SettingError(f"--alpha: expected {' or '.join(ALPHAS)}, got {self.alpha!r}")
-        if self.format != "mesh" and (self.voxel is not None or self.far is not None):
-            raise SettingError(f"--voxel, --far: expected together with --format mesh, got --format {self.format}")
-        if self.format != "usd" and self.collision:
-            raise SettingError(f"--collision: expected together with --format usd, got --format {self.format}")
-        texts = [self.title, self.caption, self.background, self.annotations, self.url]
-        if self.format != "web" and any(text not in ("", None) for text in texts):
-            names = "--title, --caption, --background, --annotations, --url"
-            raise SettingError(f"{names}: expected together with --format web, got --format {self.format}")
+        for kind, names in OPTIONS.items():
+            asked = [f"--{name}" for name in names if getattr(self, name) not in (None, "", False)]
+            if asked and self.format != kind:
+                raise SettingError(f"{asked[0]}: expected together with --format {kind}, got --format {self.format}")
         if not re.fullmatch(r"(https?://[^\s/]+\S*)?", self.url):
             raise SettingError(f"--url: expected an address that begins with https://, got {self.url!r:.60}")
         parse_color(self.background)

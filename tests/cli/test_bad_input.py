@@ -28,7 +28,7 @@ def refuses(tmp_path, capsys) -> Callable[..., None]:
     ("flags", "words"),
     [
         (["--preset", "papr"], ["preset", "expected one of default, fast, paper", "'papr'"]),
-        (["--max-hits", "9"], ["max-hits", "expected 0 to 8", "got 9"]),
+        (["--max-hits", "9"], ["max_hits", "at most 8", "got 9"]),
         (["--downscale", "37"], ["downscale", "expected at most", "got 37"]),
         (["--device", "gpu"], ["--device", "expected cuda or cpu", "'gpu'"]),
         (["--format", "blender"], ["expected transforms_train.json of a Blender scene"]),

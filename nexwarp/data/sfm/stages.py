@@ -10,7 +10,7 @@ from functools import partial
 from itertools import combinations, product
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from nexwarp.data.colmap import read_model
 from nexwarp.data.images import read_image
@@ -245,11 +245,11 @@ class Stages:
         chosen = self.options.mapper
         used = "global" if chosen == "global" else "incremental"
         if used == "incremental":
-            models = self._mapped(self._incrementally(done))
+            models = _largest_first(self._incrementally(done))
         missed = not models or models[0].num_reg_images() < len(overlaps.features)
         if chosen == "global" or (chosen == "auto" and missed and not self.views):
             try:
-                others = self._mapped(self._globally())
+                others = _largest_first(self._globally())
             except ValueError:
                 if chosen == "global":
                     raise
@@ -265,54 +265,33 @@ class Stages:
             )
         return models, used
 
-    @staticmethod
-    def _mapped(made: dict[int, "pycolmap.Reconstruction"]) -> list["pycolmap.Reconstruction"]:
-        """Return models, largest first."""
-        return sorted(made.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-
     def _incrementally(self, done: Callable[[int], None]) -> dict[int, "pycolmap.Reconstruction"]:
         """Register one photo after another."""
-        pycolmap = pycolmap_module()
+        pycolmap, registered = pycolmap_module(), list[None]()
         options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = options.mapper.num_threads = self.threads
-        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = self.options.seed
-        options.min_model_size = MIN_MODEL
+        options.triangulation.random_seed = self.options.seed
         options.constant_cameras, options.ba_refine_sensor_from_rig = self.known, False
-        registered = 0
-
-        def first_pair() -> None:
-            nonlocal registered
-            registered = 2
-
-        def next_photo() -> None:
-            nonlocal registered
-            registered += 1
-
-        folder = self.folder / "models"
-        folder.mkdir()
-        return run_stage(
-            "mapping",
-            lambda: pycolmap.incremental_mapping(
-                self.database,
-                self.readable,
-                folder,
-                options,
-                initial_image_pair_callback=first_pair,
-                next_image_callback=next_photo,
-            ),
-            lambda: done(registered),
+        run = partial(
+            pycolmap.incremental_mapping,
+            initial_image_pair_callback=lambda: registered.extend([None, None]),
+            next_image_callback=lambda: registered.append(None),
         )
+        return self._mapped(run, options, "models", lambda: done(len(registered)))
 
     def _globally(self) -> dict[int, "pycolmap.Reconstruction"]:
         """Estimate all rotations, then all positions, at once."""
         pycolmap = pycolmap_module()
-        options = pycolmap.GlobalPipelineOptions()
+        return self._mapped(pycolmap.global_mapping, pycolmap.GlobalPipelineOptions(), "global", lambda: None)
+
+    def _mapped(
+        self, run: Callable[..., dict[int, Any]], options: Any, name: str, watch: Callable[[], None]
+    ) -> dict[int, "pycolmap.Reconstruction"]:
         options.num_threads = options.mapper.num_threads = self.threads
         options.random_seed = options.mapper.random_seed = self.options.seed
         options.min_model_size = MIN_MODEL
-        folder = self.folder / "global"
+        folder = self.folder / name
         folder.mkdir()
-        return run_stage("mapping", lambda: pycolmap.global_mapping(self.database, self.readable, folder, options))
+        return run_stage("mapping", lambda: run(self.database, self.readable, folder, options), watch)
 
     def _undistort(self, model: "pycolmap.Reconstruction", done: Callable[[int], None]) -> list[tuple[int, int]]:
         """Write the scene; return the distinct sizes of its photos."""
@@ -368,6 +347,10 @@ def sequential_pairs(count: int, overlap: int) -> list[tuple[int, int]]:
                 if i != j:
                     pairs.add((min(i, j), max(i, j)))
     return sorted(pairs)
+
+
+def _largest_first(models: dict[int, "pycolmap.Reconstruction"]) -> list["pycolmap.Reconstruction"]:
+    return sorted(models.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
 
 
 def _names(model: "pycolmap.Reconstruction") -> list[str]:
