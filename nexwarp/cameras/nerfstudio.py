@@ -141,7 +141,7 @@ def load_camera_path(
     width, height = (_size(path, data, key) for key in ("render_width", "render_height"))
     fps = number_of(path, data, "fps", above=0.0) if "fps" in data else None
     cameras = []
-    for i, entry in enumerate(_list(path, data, "camera_path")):
+    for i, entry in enumerate(list_of(path, data, "camera_path")):
         where = f"{path}: camera_path[{i}]"
         pose = matrix_of(where, entry, "camera_to_world")
         if all(key in entry for key in INTRINSICS):
@@ -216,7 +216,8 @@ def _camera(
         raise ValueError(f"{where}: {error}") from None
 
 
-def _list(path: Path, data: JsonObject, key: str) -> list[JsonObject]:
+def list_of(path: Path, data: JsonObject, key: str) -> list[JsonObject]:
+    """Read a list of JSON objects, at least one and at most `MAX_CAMERAS`."""
     entries = data.get(key)
     if not isinstance(entries, list) or not 0 < len(entries) <= MAX_CAMERAS:
         expected = f"a list of at least one camera, at most {MAX_CAMERAS:,}"

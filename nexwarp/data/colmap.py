@@ -237,8 +237,8 @@ def _read_binary(
     folder: Path, points: bool
 ) -> tuple[dict[int, CameraRecord], dict[int, ImageRecord], PointRecords | None]:
     """Read cameras and images by id, and the points, if wanted; ValueError names a damaged file."""
-    cameras = _unique(folder / "cameras.bin", _records(folder / "cameras.bin", _binary_camera, MAX_IMAGES))
-    images = _unique(folder / "images.bin", _records(folder / "images.bin", _binary_image, MAX_IMAGES))
+    cameras = _unique(folder / "cameras.bin", _records(folder / "cameras.bin", _binary_camera))
+    images = _unique(folder / "images.bin", _records(folder / "images.bin", _binary_image))
     return cameras, images, _binary_points(folder / "points3D.bin") if points else None
 
 
@@ -277,15 +277,13 @@ class _Reader:
         return self.read((end if end >= 0 else len(self.content)) - self.position + 1)[:-1]
 
 
-def _records(path: Path, read: Callable[[_Reader], Record], limit: int) -> Iterator[Record]:
+def _records(path: Path, read: Callable[[_Reader], Record]) -> Iterator[Record]:
     """Read the records of a binary file, whose number is its first one, to its end."""
     if not path.stat().st_size:
         raise ValueError(f"{path}: truncated or damaged, expected more records than the file holds")
     with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
         reader = _Reader(path, content)
-        if (count := reader.number()) > limit:
-            raise ValueError(f"{path}: expected at most {limit:,} records, got {count:,}")
-        for _ in range(count):
+        for _ in range(reader.number()):
             yield read(reader)
         if reader.position != len(content):
             sizes = f"expected {reader.position:,} bytes as its counts say, got {len(content):,}"
@@ -328,7 +326,7 @@ def _binary_points(path: Path) -> PointRecords:
         heads += head
         tracks += file.read(8 * int.from_bytes(head[-8:], "little"))
 
-    for _ in _records(path, read, MAX_POINTS):
+    for _ in _records(path, read):
         pass
     return _sorted(path, heads, np.frombuffer(tracks, "<u4")[::2].copy())
 
@@ -416,14 +414,14 @@ def _text_points(path: Path) -> PointRecords:
                 raise ValueError
         except (ValueError, IndexError, OverflowError, struct.error):
             raise _unreadable(where, "id, position, colour, error and track of a point", line) from None
-        if len(heads) > MAX_POINTS * POINT.size:
-            raise ValueError(f"{path}: expected at most {MAX_POINTS:,} points, got more")
     return _sorted(path, heads, np.frombuffer(seen_by, np.uint32))
 
 
 def _sorted(path: Path, heads: bytearray, seen_by: np.ndarray) -> PointRecords:
     """Sort points by ascending id, so that binary and text models give the same result."""
     table = np.frombuffer(heads, POINTS)
+    if len(table) > MAX_POINTS:
+        raise ValueError(f"{path}: expected at most {MAX_POINTS:,} points, got {len(table):,}")
     order = np.argsort(table["id"], kind="stable")
     rank = np.empty(len(order), np.int32)
     rank[order] = np.arange(len(order))

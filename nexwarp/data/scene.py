@@ -322,26 +322,17 @@ def load_scene(
 
 def _check_types(source: SceneSource) -> None:
     """Raise TypeError naming a field of another type."""
-    nothing = type(None)
-    kinds: dict[str, tuple[tuple[type, ...], str]] = {
-        "path": ((str, os.PathLike), "a path"),
-        "images": ((str,), "the name of a folder"),
-        "masks": ((str, nothing), "the name of a folder"),
-        "points": ((str, os.PathLike, nothing), "the path of a PLY file"),
-        "format": ((str, nothing), "text"),
-        "follow_links": ((bool,), "True or False"),
-        "skip_missing": ((bool,), "True or False"),
-        "downscale": ((int,), "an int"),
-        "linear": ((int, float, nothing), "a number"),
-        "exclude": ((tuple, list), "a list of names"),
-    }
-    for name, (kind, expected) in kinds.items():
-        value = getattr(source, name)
+    text, path, numbers = (str, type(None)), (str, os.PathLike), (int, float, type(None))
+    kinds: dict[str, tuple[type, ...]] = {"path": path, "images": (str,), "masks": text, "format": text}
+    kinds |= {"points": (*path, type(None)), "follow_links": (bool,), "skip_missing": (bool,), "downscale": (int,)}
+    kinds |= {"linear": numbers, "exclude": (tuple, list)}
+    values = [(name, getattr(source, name), kind) for name, kind in kinds.items()]
+    if isinstance(source.exclude, (tuple, list)):
+        values += [("exclude", name, (str,)) for name in source.exclude]
+    for name, value, kind in values:
         if not isinstance(value, kind) or (isinstance(value, bool) and bool not in kind):
+            expected = " or ".join(each.__name__ for each in kind)
             raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}")
-    for name in source.exclude:
-        if not isinstance(name, str):
-            raise TypeError(f"exclude: expected names of photos, got {type(name).__name__}")
 
 
 def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | None) -> Scene:

@@ -9,12 +9,10 @@ import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import cast
 
 import numpy as np
 
-from nexwarp.cameras.camera import MAX_CAMERAS
-from nexwarp.cameras.nerfstudio import intrinsics_of, matrix_of, merged, number_of
+from nexwarp.cameras.nerfstudio import intrinsics_of, list_of, matrix_of, merged, number_of
 from nexwarp.data.capture import (
     Capture,
     Cloud,
@@ -112,8 +110,8 @@ def read_blender(path: Path, images: str, follow_links: bool = False, skip_missi
 
 def _read_frames(file: Path, images: str, follow_links: bool, skip_missing: bool) -> _Frames:
     data = read_object(file, finite=True)
-    entries = _entries(file, data, "frames")
-    tests = [] if data.get("test_frames") is None else _entries(file, data, "test_frames")
+    entries = list_of(file, data, "frames")
+    tests = [] if data.get("test_frames") is None else list_of(file, data, "test_frames")
     _name_unread(file, data, entries + tests)
     frames = _Frames(file, data, [], set(), [], _inverse_applied(file, data), follow_links)
     seen: dict[Path, str] = {}
@@ -141,19 +139,6 @@ def _read_frames(file: Path, images: str, follow_links: bool, skip_missing: bool
     return frames
 
 
-def _entries(file: Path, data: JsonObject, key: str) -> list[JsonObject]:
-    """Check a list of frames."""
-    entries = data.get(key)
-    if not isinstance(entries, list) or not entries:
-        raise ValueError(f"{file}: {key}: expected a list of at least one frame, got {short(entries)}")
-    if len(entries) > MAX_CAMERAS:
-        raise ValueError(f"{file}: {key}: expected at most {MAX_CAMERAS:,} frames, got {len(entries):,}")
-    for index, entry in enumerate(entries):
-        if not isinstance(entry, dict):
-            raise ValueError(f"{file}: {key.removesuffix('s')} {index}: expected a JSON object, got {short(entry)}")
-    return cast(list[JsonObject], entries)
-
-
 def _name_unread(file: Path, data: JsonObject, entries: list[JsonObject]) -> None:
     """Warn of keys that have no meaning here."""
     unread = {key for key, value in data.items() if value is not None} - FILE_KEYS
@@ -172,13 +157,13 @@ def _photo(where: str, frames: _Frames, entry: JsonObject, name: str, file: Path
 
 
 def _named_file(where: str, frames: _Frames, entry: JsonObject, key: str) -> Path | None:
-    """The file that a key of a frame names, in the scene's folder; None without the key."""
+    """The file that a key names, in the scene's folder; None without the key."""
     if entry.get(key) is None:
         return None
-    folder, what = frames.file.parent, "mask" if key == "mask_path" else "depth map"
+    folder = frames.file.parent
     path = find_file(folder, _file_name(where, key, entry[key], folder))
     if not path.is_file():
-        raise FileNotFoundError(f"{where}: {what} not found: {path}")
+        raise FileNotFoundError(f"{where}: {key}: file not found: {path}")
     return inside_folder(f"{where}: {key}", path, folder, frames.follow_links)
 
 
@@ -244,17 +229,12 @@ def _split(frames: _Frames) -> tuple[list[Photo], frozenset[str] | None]:
 def _points(frames: _Frames, beside: str | None = None) -> Cloud | None:
     """Read the points that the file names, or those of the file `beside` it if it exists, in the original world."""
     folder = frames.file.parent
-    named = frames.data.get("ply_file_path")
-    if named is not None:
-        key = "ply_file_path"
-        path = find_file(folder, _file_name(str(frames.file), key, named, folder))
-        if not path.is_file():
-            raise FileNotFoundError(f"{frames.file}: {key}: points not found: {path}")
-    elif beside is not None and (folder / beside).is_file():
-        key, path = "points", folder / beside
-    else:
+    path = _named_file(str(frames.file), frames, frames.data, "ply_file_path")
+    if path is None and beside is not None and (folder / beside).is_file():
+        path = inside_folder(f"{frames.file}: points", folder / beside, folder, frames.follow_links)
+    if path is None:
         return None
-    cloud = read_ply(inside_folder(f"{frames.file}: {key}", path, folder, frames.follow_links))
+    cloud = read_ply(path)
     moved = cloud.positions @ frames.to_original[:3, :3].T + frames.to_original[:3, 3]
     check_points(path, moved, "points in the original world", lambda index: f"vertex {index}")
     # Some releases of nerfstudio transformed only the cameras and left the points in the original world.

@@ -29,7 +29,7 @@ from nexwarp.io.files import one_line
 
 MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 OPAQUE = 255
-# A larger side than this ratio times the camera's is refused before decoding, since tiny files can hold huge images.
+# A side larger than both, the ratio in those of the camera, is refused before decoding.
 MAX_ENLARGED, SMALL = 16, 1024
 KEPT_MAPS = 6  # for the faces of a panorama
 SHAPE_TOLERANCE = 0.02  # of the ratio of a depth map's sides: networks have sides that are multiples of 14, say
@@ -117,11 +117,9 @@ class ViewReader:
         # Tolerance: the size of a reduced image, as in a folder images_4, is rounded by up to one pixel.
         full = (lens.width, lens.height)
         _check_shape(photo.file, size, full, "an image", max(full))
-        _check_enlarged(photo.file, size, full, "its camera")
         if photo.mask is not None and not self.alpha_mask:
             shape = image_size(photo.mask)
             _check_shape(photo.mask, shape, size, "a mask", max(*size, *shape), photo)
-            _check_enlarged(photo.mask, shape, size, "its photo")
         try:
             target = undistorted(lens)
         except (ValueError, RuntimeError) as error:
@@ -228,18 +226,16 @@ def _mask(photo: Photo, image: torch.Tensor, alpha: torch.Tensor | None) -> torc
 def _check_shape(
     file: Path, size: tuple[int, int], expected: tuple[int, int], what: str, slack: float, photo: Photo | None = None
 ) -> None:
-    """Raise ValueError unless width and height have the ratio of those expected, which are those of a photo's file."""
+    """Raise ValueError unless width and height have the ratio of those expected, of a photo or else of its camera.
+
+    They may be at most 16 times as large: tiny files can hold huge images.
+    """
+    wanted, got = f"{expected[0]}x{expected[1]}", f"{size[0]}x{size[1]}"
     if abs(size[0] * expected[1] - size[1] * expected[0]) > slack:
         whose = "" if photo is None else f" as {photo.file.name} has"
-        raise ValueError(
-            f"{file}: expected {what} of {expected[0]}x{expected[1]} pixels{whose}, or that shape at another size, "
-            f"got {size[0]}x{size[1]}"
-        )
-
-
-def _check_enlarged(file: Path, size: tuple[int, int], expected: tuple[int, int], what: str) -> None:
+        raise ValueError(f"{file}: expected {what} of {wanted} pixels{whose}, or that shape at another size, got {got}")
     if max(size) > max(MAX_ENLARGED * max(expected), SMALL):
+        whose = "its camera" if photo is None else "its photo"
         raise ValueError(
-            f"{file}: expected an image of at most {MAX_ENLARGED} times the size of {what}, "
-            f"{expected[0]}x{expected[1]}, got {size[0]}x{size[1]}"
+            f"{file}: expected an image of at most {MAX_ENLARGED} times the size of {whose}, {wanted}, got {got}"
         )

@@ -193,7 +193,7 @@ def test_maps_that_transforms_json_names(folder: Path, monkeypatch: pytest.Monke
     for view in load_unfitted(scene, monkeypatch).train:
         assert (present(view.depth) - torch.from_numpy(maps[view.name])).abs().max() < 2e-3
     shutil.rmtree(scene / "metres")
-    with pytest.raises(MissingError, match=r"depth map not found: .*metres"):
+    with pytest.raises(MissingError, match=r"depth_file_path: file not found: .*metres"):
         nw.load_scene(scene)
 
 

@@ -221,8 +221,8 @@ def test_many_points_load_in_little_memory(tmp_path):
 
 def test_too_many_points(tmp_path, monkeypatch):
     monkeypatch.setattr("nexwarp.data.colmap.MAX_POINTS", 19)
-    refused(make_scene(tmp_path / "a"), r"points3D\.bin: expected at most 19 records, got 20")
-    refused(make_scene(tmp_path / "b", text=True), r"points3D\.txt: expected at most 19 points, got more")
+    refused(make_scene(tmp_path / "a"), r"points3D\.bin: expected at most 19 points, got 20")
+    refused(make_scene(tmp_path / "b", text=True), r"points3D\.txt: expected at most 19 points, got 20")
 
 
 @pytest.mark.parametrize(

@@ -140,8 +140,8 @@ def test_a_name_with_brackets_is_a_name(tmp_path):
         (["01.PNG"], SceneError, "no photo"),
         (["0[1-7].png", "09.png"], SceneError, "expected to leave a training photo of"),
         (["*"], SceneError, "expected to leave a training photo of"),
-        ("01.png", TypeError, "exclude: expected a list of names, got str"),
-        ([1], TypeError, "exclude: expected names of photos, got int"),
+        ("01.png", TypeError, "exclude: expected tuple or list, got str"),
+        ([1], TypeError, "exclude: expected str, got int"),
     ],
 )
 def test_what_cannot_be_excluded_is_told(tmp_path, exclude, error, match):
