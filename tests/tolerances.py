@@ -48,6 +48,13 @@ def assert_close(
     )
 
 
+def assert_equal(actual: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> None:
+    """Fail unless tensors of the same names have the same values, to the last bit."""
+    assert actual.keys() == expected.keys()
+    different = [name for name, x in expected.items() if not torch.equal(actual[name], x)]
+    assert not different, different
+
+
 def assert_same_ids(actual: torch.Tensor, expected: torch.Tensor, *, name: str, allow_flips: float = 0.0) -> None:
     """Fail unless the integer images (H, W, K) agree in all pixels but at most the fraction `allow_flips`."""
     assert actual.shape == expected.shape, f"{name}: shape {tuple(actual.shape)}, not {tuple(expected.shape)}"

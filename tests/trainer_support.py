@@ -8,6 +8,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
+from tests.tolerances import assert_equal
 
 TEXTURE = TextureConfig(levels=4, table_size=2**10, width=16)
 # Rounds of density control at 3, 6 and 9 of 12 iterations, so that a short run has them all.
@@ -30,10 +31,7 @@ def state_of(trainer: nw.Trainer) -> dict[str, torch.Tensor]:
 
 
 def assert_same_state(one: nw.Trainer, other: nw.Trainer) -> None:
-    first, second = state_of(one), state_of(other)
-    assert first.keys() == second.keys()
-    different = [name for name, value in first.items() if not torch.equal(value, second[name])]
-    assert not different, different
+    assert_equal(state_of(one), state_of(other))
 
 
 def trained(scene: nw.Scene, config: Config) -> nw.Trainer:

@@ -431,28 +431,21 @@ def quick(monkeypatch, arc, tmp_path):
     return make
 
 
-def test_two_processes_do_not_disturb_each_other(quick, tmp_path):
-    def second(stage: str, done: int, total: int) -> None:
-        quick()
-        expected.update(snapshot(tmp_path / "new" / "scene"))
-
-    expected: dict[str, bytes] = {}
-    with pytest.raises(FileExistsError, match="scene: appeared while the scene was made; not touching it"):
-        quick(observe=second)
-    assert {entry.name for entry in (tmp_path / "new").iterdir()} == {"scene"}
-    assert snapshot(tmp_path / "new" / "scene") == expected
-
-
-def test_what_appears_meanwhile_stays(quick, tmp_path):
-    precious = tmp_path / "new" / "scene" / "images" / "precious.txt"
+@pytest.mark.parametrize("other", ["another process", "a file"])
+def test_what_appears_meanwhile_stays(quick, tmp_path, other):
+    place, expected = tmp_path / "new" / "scene", dict[str, bytes]()
 
     def appear(stage: str, done: int, total: int) -> None:
-        precious.parent.mkdir(parents=True, exist_ok=True)
-        precious.write_text("work")
+        if other == "a file":
+            (place / "images").mkdir(parents=True, exist_ok=True)
+            (place / "images" / "precious.txt").write_text("work")
+        else:
+            quick()
+        expected.update(snapshot(place))
 
-    with pytest.raises(FileExistsError, match="not touching it"):
+    with pytest.raises(FileExistsError, match="scene: appeared while the scene was made; not touching it"):
         quick(observe=appear)
-    assert precious.read_text() == "work" and [entry.name for entry in (tmp_path / "new").iterdir()] == ["scene"]
+    assert snapshot(place) == expected and [entry.name for entry in (tmp_path / "new").iterdir()] == ["scene"]
 
 
 @pytest.mark.parametrize(

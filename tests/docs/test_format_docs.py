@@ -16,20 +16,17 @@ from examples import read_model
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.train.recipe import setting_names
-from tests.cli.support import read
+from tests.cli.support import FLAGS, read
 from tests.docs.test_docs import DOCS, ROOT
 from tests.scene_writers import expose_photos, write_demo
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
+def run(small_preset, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("docs")
     scene = write_demo(folder / "scene", width=48, height=36, views=10, points=200)
     expose_photos(scene)
-    changes = ("texture.levels=4", "texture.table_size=1024", "texture.width=16")
-    flags = [x for change in changes for x in ("--set", change)]
-    flags += ["--iterations", "5", "--max-surfels", "100", "--device", "cpu", "--checkpoint-every", "1"]
-    assert cli.main(["train", str(scene), "--run", str(folder / "run"), *flags]) == 0
+    assert cli.main(["train", str(scene), "--run", str(folder / "run"), *FLAGS]) == 0
     return folder / "run"
 
 

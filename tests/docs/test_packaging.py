@@ -3,14 +3,13 @@
 The locks in requirements/ hold what pyproject.toml and constraints.txt say, with hashes.
 """
 
-import importlib.util
 import re
+import runpy
 import shutil
 import subprocess
 import sys
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 from packaging.markers import default_environment
@@ -30,14 +29,6 @@ RUN_EXTRAS = ("viewer", "video", "tensorboard", "flip", "glb", "splats")
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 LINUX = {"sys_platform": "linux", "platform_machine": "x86_64"}
 PLATFORMS = (LINUX, {"sys_platform": "win32"}, {"sys_platform": "darwin"})
-
-
-def script(name: str) -> Any:
-    spec = importlib.util.spec_from_file_location(name, ROOT / ".ci" / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_an_editable_package_is_found_in_the_folder_above_the_clone(tmp_path: Path) -> None:
@@ -68,7 +59,8 @@ def test_the_version_has_one_value() -> None:
 
 
 def test_the_readme_on_pypi_links_to_files_that_exist() -> None:
-    text = script("package").absolute_links((ROOT / "README.md").read_text(encoding="utf-8"))
+    links = runpy.run_path(str(ROOT / ".ci" / "package.py"))["absolute_links"]
+    text = links((ROOT / "README.md").read_text(encoding="utf-8"))
     targets = re.findall(r"\]\(([^)\s]+)\)", text)
     assert targets and all(re.match(r"https?://|#", target) for target in targets)
     ours = re.findall(r"https://(?:raw\.)?github\w*\.com/nexwarp/nexwarp/(?:blob/)?main/([^)#\s]+)", text)

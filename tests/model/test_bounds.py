@@ -1,6 +1,7 @@
 import functools
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,12 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@pytest.fixture
+def file(stored: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copy(stored, tmp_path / "model.safetensors"))
+
+
 def with_number(content: bytes, name: str, value: float) -> bytes:
     """Replace the first number of a tensor in the content of a safetensors file."""
     size = int.from_bytes(content[:8], "little")
@@ -88,8 +95,7 @@ def check_message(error: Exception, file: Path, name: str) -> None:
 
 @pytest.mark.parametrize("value", VALUES)
 @pytest.mark.parametrize("name", TENSORS)
-def test_a_number_is_refused_or_renders_finite(stored, tmp_path, device, name, value):
-    file = tmp_path / "model.safetensors"
+def test_a_number_is_refused_or_renders_finite(stored, file, device, name, value):
     file.write_bytes(with_number(stored.read_bytes(), name, value))
     try:
         model = load(file)
@@ -100,8 +106,7 @@ def test_a_number_is_refused_or_renders_finite(stored, tmp_path, device, name, v
     check_pictures(model.to(device), tiny_camera().to(device), f"{name} = {value}")
 
 
-def test_half_precision_is_left_where_it_could_overflow(stored: Path, tmp_path: Path) -> None:
-    file = tmp_path / "model.safetensors"
+def test_half_precision_is_left_where_it_could_overflow(stored: Path, file: Path) -> None:
     for value, fits in ((1.0, True), (65504.0, False)):
         file.write_bytes(with_number(stored.read_bytes(), MATRICES[0], value))
         assert present(load(file).texture).half_precision == fits
@@ -115,10 +120,8 @@ def test_the_bounds_are_those_of_every_tensor(stored: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(BOUNDS.keys() - {"exposures.falloff", "surfels.raw_quats"}))
 @pytest.mark.parametrize("end", [0, 1])
-def test_bounds_themselves_render_finite(stored, tmp_path, device, name, end):
+def test_bounds_themselves_render_finite(file, device, name, end):
     """All elements at an end of the range at once, up to the float32 value next to it."""
-    file = tmp_path / "model.safetensors"
-    file.write_bytes(stored.read_bytes())
     value = torch.nextafter(torch.tensor(BOUNDS[name][end]), torch.tensor(1.0)).item()
     rewrite(file, lambda tensors, _: tensors.update({name: torch.full_like(tensors[name], value)}))
     check_pictures(load(file).to(device), tiny_camera().to(device), f"{name} = {value}")
@@ -134,9 +137,7 @@ def test_bounds_themselves_render_finite(stored, tmp_path, device, name, end):
         (dict.fromkeys(("texture.grid", *MATRICES), 1e4), "texture.mlp.2.weight: expected outputs of at most 1e+12"),
     ],
 )
-def test_numbers_that_fail_together_are_refused(stored, tmp_path, change, message):
-    file = tmp_path / "model.safetensors"
-    file.write_bytes(stored.read_bytes())
+def test_numbers_that_fail_together_are_refused(file, change, message):
 
     def apply(tensors: dict[str, torch.Tensor], _: dict[str, Any]) -> None:
         for name, value in change.items():
@@ -150,9 +151,7 @@ def test_numbers_that_fail_together_are_refused(stored, tmp_path, change, messag
 
 @pytest.mark.parametrize("value", VALUES)
 @pytest.mark.parametrize("key", ["background", "near", "scene_scale", "smooth_sh"])
-def test_a_number_of_the_metadata_is_refused_or_renders_finite(stored, tmp_path, key, value):
-    file = tmp_path / "model.safetensors"
-    file.write_bytes(stored.read_bytes())
+def test_a_number_of_the_metadata_is_refused_or_renders_finite(file, key, value):
     rewrite(file, lambda _, meta: meta.update({key: [0.1, value, 0.2] if key == "background" else value}))
     try:
         model = load(file)

@@ -2,6 +2,7 @@ import gc
 import weakref
 from functools import partial
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -76,17 +77,11 @@ def test_rows_that_warp_cannot_address_are_refused():
     assert _interop.array(single, types(_interop.real_of(single)).real) is not None
 
 
-def limit_memory(monkeypatch: pytest.MonkeyPatch, device: torch.device, size: int) -> None:
-    if device.type == "cuda":
-        found = type("Properties", (), {"total_memory": size})
-        monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: found)
-    monkeypatch.setattr(memory, "available_memory", lambda: size)
-
-
 @pytest.mark.usefixtures("no_allocation")
 def test_an_image_that_memory_cannot_hold_is_refused_before_anything_is_allocated(monkeypatch, device):
     surfels, texture, camera = parts(device, width=8192, height=8192)
-    limit_memory(monkeypatch, device, 3 * GIB)
+    monkeypatch.setattr(memory, "available_memory", lambda: 3 * GIB)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: Mock(total_memory=3 * GIB))
     where = "are free" if device.type == "cpu" else "are on the GPU"
     for textured in (texture, None):
         for call in renderings(surfels, textured, camera, 2):

@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import itertools
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,15 @@ from nexwarp.model.buffers import load_buffers, render_buffers
 from nexwarp.model.options import Exposure, RenderChanges
 from nexwarp.model.render import draw
 from nexwarp.run.folder import RunRecord, create_run
+from tests import render_support
 from tests.cli.support import picture
+from tests.render_support import BUFFERS
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
-from tests.tolerances import assert_finite
+from tests.tolerances import assert_equal, assert_finite
 
-FIELDS = ("image", "plain", "textured", "ids", "depths", "weights", "alpha")
+FIELDS = (*BUFFERS, "ids")
 LAZY = ("expected_depth", "median_depth", "top_depth", "normals")
+assert_same = functools.partial(render_support.assert_same, buffers=FIELDS + LAZY)
 OPTIONS = nw.RenderOptions(max_hits=3, background=(0.2, 0.5, 0.9), sh_degree=2)
 FALLOFF = (-0.3, -0.2, 0.4)
 
@@ -51,11 +55,6 @@ def full_model(device: torch.device | str = "cpu", falloff: tuple[float, float, 
     return nw.Model(surfels, make_texture(device=device), exposures, limits, OPTIONS, {"near": 0.01, "iteration": 7})
 
 
-def assert_same(one: nw.Rendering, other: nw.Rendering, names: tuple[str, ...] = FIELDS + LAZY) -> None:
-    for name in names:
-        assert torch.equal(getattr(one, name), getattr(other, name)), name
-
-
 def pure(model: nw.Model, camera: nw.Camera, **parts: Any) -> nw.Rendering:
     """The rendering of a model's surfels and texture, with the given parts only."""
     return draw(model.surfels, model.texture, camera, model.options, **parts)
@@ -82,8 +81,7 @@ def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flag
         assert out.image.std() > 0.05
         if "--buffers" in flags:
             stored = load_buffers(run / "renders" / "test" / f"{Path(name).stem}.exr")
-            for field in FIELDS + LAZY:
-                assert torch.equal(getattr(stored, field), getattr(out, field)), field
+            assert_same(stored, out)
 
 
 @pytest.mark.parametrize("falloff", [None, FALLOFF])
@@ -154,9 +152,7 @@ def test_rendering_changes_nothing(device: torch.device) -> None:
         assert_same(one, other)
     assert all(vars(model)["_modules"][name] is part for name, part in parts.items())
     assert model.options is OPTIONS and all(parameter.grad is None for parameter in model.parameters())
-    assert model.state_dict().keys() == before.keys()
-    for name, x in model.state_dict().items():
-        assert torch.equal(x, before[name]), name
+    assert_equal(model.state_dict(), before)
 
 
 def test_nothing_is_rendered_twice(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,8 +181,7 @@ def test_nothing_is_rendered_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     calls.clear()
     buffers = render_buffers(model, camera)
     assert calls == [*stages, "surface"]
-    for name in LAZY:
-        assert torch.equal(getattr(buffers, name), getattr(out, name)), name
+    assert_same(buffers, out, buffers=LAZY)
 
 
 def test_gradients_are_those_of_the_pure_rendering(device: torch.device) -> None:
@@ -251,8 +246,7 @@ def test_a_folder_and_a_file_load_the_same(tmp_path: Path) -> None:
         assert torch.equal(loaded[0].state_dict()[name], exact), name
     again = nw.load(loaded[0].save(tmp_path / "again.safetensors"))
     assert again.options == OPTIONS and again.meta == loaded[0].meta
-    for name, x in again.state_dict().items():
-        assert torch.equal(x, loaded[0].state_dict()[name]), name
+    assert_equal(again.state_dict(), loaded[0].state_dict())
 
 
 def test_models_move_as_a_whole(device: torch.device) -> None:

@@ -3,7 +3,7 @@ import torch
 
 import nexwarp as nw
 from tests import scenes
-from tests.render_support import BACKGROUND, BUFFERS, MAX_HITS, assert_alike, assert_same, draw, reference_render, twin
+from tests.render_support import BACKGROUND, BUFFERS, assert_alike, assert_same, draw, reference_render, twin
 from tests.scenes import SURFEL_KEYS, Scene, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close, assert_same_ids
 
@@ -16,14 +16,6 @@ def test_the_order_of_the_surfels_changes_nothing(device: torch.device) -> None:
     assert_same(other, out)
     mapped = torch.where(other.ids >= 0, permutation[other.ids.clamp_min(0).long()], -1)
     assert torch.equal(mapped, out.ids.long())
-
-
-def test_without_texture_max_hits_does_not_matter(device: torch.device) -> None:
-    scene = random_scene(dtype=torch.float64, device=device)
-    expected = draw(scene, max_hits=0)
-    assert expected.ids.shape == (18, 23, 0) and not expected.textured.any()
-    for max_hits in (1, 2, 3, MAX_HITS):
-        assert_alike(draw(scene, max_hits=max_hits), expected, ("image", "alpha"))
 
 
 @pytest.mark.parametrize("textured", [False, True])
@@ -87,15 +79,6 @@ def test_awkward_surfels_agree_with_the_reference(device: torch.device) -> None:
     expected = reference_render(twin(surfels), None, camera.to("cpu"), max_hits=4)
     assert_same_ids(out.ids, expected.ids, name="ids")
     assert_alike(out, expected)
-
-
-@pytest.mark.parametrize("max_hits", [0, 1, 2, 3, 5, 8])
-def test_every_buffer_size(max_hits: int, device: torch.device) -> None:
-    scene = scenes.layered_scene(device=device)
-    most, out = (draw(scene, max_hits=size) for size in (MAX_HITS, max_hits))
-    assert_same_ids(out.ids, most.ids[..., :max_hits], name="ids")
-    for name in ("weights", "depths"):
-        assert_close(getattr(out, name), getattr(most, name)[..., :max_hits], kind="value", name=name)
 
 
 def in_a_row(device: torch.device, opacities: list[float], scale: float = 100.0, depth: float = 1.0) -> Scene:

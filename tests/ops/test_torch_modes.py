@@ -11,7 +11,7 @@ from nexwarp.model.buffers import PASSES, render_buffers
 from nexwarp.train.trainer import Trainer
 from tests.narrowing import neural, present
 from tests.render_support import BACKGROUND, BUFFERS, assert_same, cameras, finished, loss
-from tests.tolerances import assert_close
+from tests.tolerances import assert_close, assert_equal
 from tests.trainer_support import assert_same_state, small
 
 pytestmark = pytest.mark.usefixtures("fixed_order")
@@ -33,12 +33,6 @@ def gradients(model: nw.Model, camera: nw.Camera) -> dict[str, torch.Tensor]:
     loss(model.render(camera, background=BACKGROUND)).backward()
     found = {name: present(x.grad).clone() for name, x in model.named_parameters()}
     return found | {"viewmat": present(camera.viewmat.grad).clone()}
-
-
-def assert_equal(actual: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> None:
-    assert actual.keys() == expected.keys()
-    different = [name for name, x in expected.items() if not torch.equal(actual[name], x)]
-    assert not different, different
 
 
 @pytest.mark.usefixtures("restore_threads")

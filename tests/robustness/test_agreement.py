@@ -16,7 +16,7 @@ CASES = [
     # or "residual"), max_hits, sh_degree, clamp_texture
     ("random", True, 2, 3, False),
     ("random", True, 1, 1, True),
-    ("random", True, 4, 2, True),
+    ("random", True, 3, 2, True),
     ("random", False, 2, 3, False),
     ("random", True, 0, 3, False),
     ("layered", True, 2, 3, False),
@@ -27,7 +27,7 @@ CASES = [
     ("specks", True, 2, 3, False),
     ("near", True, 2, 3, False),
     ("random", "residual", 2, 3, False),
-    ("layered", "residual", 8, 1, False),
+    ("layered", "residual", 5, 1, False),
     ("off_centre", "residual", 1, 2, False),
     ("random", "residual", 0, 3, False),
     ("wide", True, 2, 3, False),

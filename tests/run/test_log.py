@@ -9,12 +9,11 @@ import torch
 
 from nexwarp.run.folder import LOG_FILE, TENSORBOARD_FOLDER
 from nexwarp.run.log import TrainingLog, keep_lines
-from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
+from tests.trainer_support import small
 
-TEXTURE = TextureConfig(levels=4, table_size=2**8, width=16)
-CONFIG = Config(iterations=12, max_surfels=60, texture=TEXTURE, densify=DensifyConfig(every=3))
+CONFIG = small(max_surfels=60)
 CLOCK = ("iterations_per_second", "seconds", "memory_bytes")
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from nexwarp.train.checkpoint import CHECKPOINTS, _read_checkpoint, load_checkpoint, save_checkpoint
+from tests.tolerances import assert_equal
 
 
 def save_number(run: Path, number: int) -> None:
@@ -24,8 +25,8 @@ def test_checkpoint_round_trip(tmp_path):
     state = {"iteration": 3, "order": [2, 0, 1], "python": [3, [1, 2], None], "seconds": 0.1}
     save_checkpoint(tmp_path, tensors, state)
     loaded, again = load_checkpoint(tmp_path)
-    assert again == state and loaded.keys() == tensors.keys()
-    assert all(torch.equal(loaded[name], tensors[name]) for name in tensors)
+    assert again == state
+    assert_equal(loaded, tensors)
     save_number(tmp_path, 4)
     tensors, state = load_checkpoint(tmp_path)
     assert tensors["x"].tolist() == [4.0] * 3 and state == {"iteration": 4} and kept(tmp_path) == [4, 3]

@@ -14,15 +14,15 @@ from nexwarp.train import state, trainer
 from nexwarp.train.checkpoint import save_checkpoint
 from nexwarp.train.losses import step_losses
 from nexwarp.train.optimizer import make_optimizer
-from nexwarp.train.recipe import Config, DensifyConfig, TextureConfig
+from nexwarp.train.recipe import DensifyConfig
 from nexwarp.train.report import not_finite
 from nexwarp.train.trainer import Trainer
+from tests.trainer_support import small
 
 pytestmark = pytest.mark.usefixtures("small_preset")
 
 NAN, INF = math.nan, math.inf
-TEXTURE = TextureConfig(levels=2, table_size=2**6, width=8)
-SMALL = Config(iterations=40, max_surfels=60, texture=TEXTURE, densify=DensifyConfig(every=5))
+SMALL = small(iterations=40, max_surfels=60, densify=DensifyConfig(every=5))
 FLAGS = ["--iterations", "40", "--max-surfels", "60", "--device", "cpu"]
 
 

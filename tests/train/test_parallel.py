@@ -34,11 +34,8 @@ pytestmark = pytest.mark.usefixtures("small_preset")
 # the time of so short a training.
 SMALL = Config(exposures=False, texture=TEXTURE, densify=OFTEN)
 TRAIN = ["--iterations", "24", "--max-surfels", "100", "--device", "cpu"]
+SHORT = small(iterations=24)
 OFTEN_SAVED = [*TRAIN, "--checkpoint-every", "2"]
-
-
-def short_config() -> Config:
-    return small(iterations=24)
 
 
 def test_an_incomplete_last_step_is_the_mean_of_its_views(scene: nw.Scene, tmp_path: Path) -> None:
@@ -61,7 +58,7 @@ def test_ranks_train_one_model(scene: nw.Scene, tmp_path: Path, size: int, steps
     """One fork of the ranks for the laws of a whole training: a process costs more than a law."""
 
     def work(ranks: Ranks) -> object:
-        first = ParallelTrainer(scene, short_config(), CPU, ranks)
+        first = ParallelTrainer(scene, SHORT, CPU, ranks)
         with kept_gradients(first) as gradients:
             first.step()
         if ranks.first:
@@ -71,12 +68,12 @@ def test_ranks_train_one_model(scene: nw.Scene, tmp_path: Path, size: int, steps
         seen: list[int] = []
         replica.run(lambda step: seen.append(step.iteration))
         # Straight to the end, and resumed in the middle.
-        straight = ParallelTrainer(scene, short_config(), CPU, ranks)
+        straight = ParallelTrainer(scene, SHORT, CPU, ranks)
         straight.run()
-        halfway = ParallelTrainer(scene, short_config(), CPU, ranks)
+        halfway = ParallelTrainer(scene, SHORT, CPU, ranks)
         halfway.run(until=12)
         halfway.save(tmp_path / "run")
-        resumed = ParallelTrainer(scene, short_config(), CPU, ranks)
+        resumed = ParallelTrainer(scene, SHORT, CPU, ranks)
         torch.manual_seed(99)
         ranks.barrier()
         resumed.restore(tmp_path / "run")
@@ -94,7 +91,7 @@ def test_ranks_train_one_model(scene: nw.Scene, tmp_path: Path, size: int, steps
     told = safetensors.torch.load_file(tmp_path / "gradients.safetensors")
     alone = []
     for rank in range(size):
-        one = alone_as(rank, size, scene, short_config())
+        one = alone_as(rank, size, scene, SHORT)
         with kept_gradients(one) as gradients:
             one.step()
         alone.append(gradients[0])
@@ -102,7 +99,7 @@ def test_ranks_train_one_model(scene: nw.Scene, tmp_path: Path, size: int, steps
         # Each alone has weighted its loss by 1 / size.
         assert_close(value, torch.stack([each[name] for each in alone]).sum(0), kind="gradient", name=name)
     # One process goes on from the checkpoint of several.
-    trainer = nw.Trainer(scene, short_config(), CPU)
+    trainer = nw.Trainer(scene, SHORT, CPU)
     trainer.restore(tmp_path / "run")
     assert trainer.iteration == 12
     trainer.run()
@@ -132,8 +129,8 @@ def test_each_epoch_sees_each_view_once(scene: nw.Scene) -> None:
 
 
 def test_rates_follow_the_square_root_of_the_batch(scene: nw.Scene) -> None:
-    one = nw.Trainer(scene, short_config(), CPU)
-    four = nw.Trainer(scene, short_config(), CPU)
+    one = nw.Trainer(scene, SHORT, CPU)
+    four = nw.Trainer(scene, SHORT, CPU)
     scale_for_batch(four.optimizer, 4)
     for before, after in zip(one.optimizer.param_groups, four.optimizer.param_groups, strict=True):
         assert after["ends"] == pytest.approx(tuple(2 * rate for rate in before["ends"]))

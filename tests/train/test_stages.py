@@ -22,6 +22,7 @@ from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import TextureConfig
 from nexwarp.train.stages import VIEW_COST, OwnTeachers, StageRunner, divide, plan_teachers, shortened
+from tests.cli.support import snapshot
 
 CPU = torch.device("cpu")
 CONFIG = nw.Config(
@@ -273,27 +274,23 @@ def test_what_is_not_the_runs_is_not_taken_for_a_teacher(run, command, tmp_path,
     place = run / "teachers"
     place.rename(tmp_path / "elsewhere")
     place.symlink_to(tmp_path / "elsewhere") if kind == "link" else place.write_text("mine")
-    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
-    capsys.readouterr()
+    before = snapshot(tmp_path)
     assert command(run, "--overwrite") == 2
-    told = " ".join(capsys.readouterr().err.split())
-    assert f"{place}: expected a teacher's folder or nothing, got what nexwarp did not write".replace(" ", "") in (
-        told.replace(" ", "")
-    )
-    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+    told = capsys.readouterr().err
+    assert f"{place}: expected a teacher's folder or nothing, got what nexwarp did not write" in told
+    assert snapshot(tmp_path) == before
 
 
 def test_a_run_that_lost_a_teacher_says_so_before_it_trains(run, finished, command, capsys):
     shutil.rmtree(run / "teachers" / "2")
-    capsys.readouterr()
     assert command(run, "--resume", iterations=30) == 2
-    told = "".join(capsys.readouterr().err.split())
-    assert f"{run}/teachers/2:expectedthecompleteteacherthatthestudentin{run}haslearnedfrom" in told
+    told = capsys.readouterr().err
+    assert f"{run}/teachers/2: expected the complete teacher that the student in {run} has learned from" in told
     assert read_run(run).config.iterations == 20 and not (run / "teachers" / "2").exists()
     shutil.copytree(finished / "teachers" / "1", run / "teachers" / "2")
     assert command(run, "--resume") == 2
-    told = "".join(capsys.readouterr().err.split())
-    assert f"{run}/teachers/2:expectedateacherwiththesettingsof{run},gotothers" in told
+    told = capsys.readouterr().err
+    assert f"{run}/teachers/2: expected a teacher with the settings of {run}, got others" in told
 
 
 def test_memory_that_a_teacher_lacks_is_told_as_its_own(command, tmp_path, monkeypatch, capsys):

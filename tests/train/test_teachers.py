@@ -7,24 +7,17 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp import Config, Model, Scene, Trainer
+from nexwarp import Model, Scene, Trainer
 from nexwarp.cli import main as cli
 from nexwarp.errors import CheckpointError
 from nexwarp.model.exposures import Exposures
 from nexwarp.train.checkpoint import CHECKPOINTS
-from nexwarp.train.recipe import TextureConfig
 from tests.ranks_support import alone_as
-from tests.trainer_support import assert_resumed_alike
+from tests.trainer_support import assert_resumed_alike, small
 
 CPU = torch.device("cpu")
-CONFIG = Config(
-    iterations=12,
-    max_surfels=60,
-    exposures=False,
-    background=(0.5, 0.4, 0.3),
-    skybox=0,  # its colours are of the photos
-    texture=TextureConfig(levels=4, table_size=1024),
-)
+# Colours of a skybox are of the photos.
+CONFIG = small(max_surfels=60, exposures=False, background=(0.5, 0.4, 0.3), skybox=0)
 
 
 @pytest.fixture(scope="module")
@@ -139,10 +132,10 @@ def test_teachers_of_another_scene_are_refused(tiny_scene: Scene, teachers: list
 
 def test_the_command_learns_from_runs(tiny_folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    small = ["--iterations", "10", "--max-surfels", "60", "--device", "cpu", "--set", "texture.table_size=1024"]
+    few = ["--iterations", "10", "--max-surfels", "60", "--device", "cpu", "--set", "texture.table_size=1024"]
 
     def train(run: str, *options: str) -> int:
-        return cli.main(["train", str(tiny_folder), "--run", run, *small, *options])
+        return cli.main(["train", str(tiny_folder), "--run", run, *few, *options])
 
     for run, seed in (("a", "1"), ("b", "2")):
         assert train(run, "--seed", seed) == 0

@@ -12,7 +12,7 @@ from nexwarp.run.evaluate import evaluate
 from nexwarp.train.recipe import DensifyConfig, LearningRates
 from tests.narrowing import neural
 from tests.scene_writers import with_exposures
-from tests.tolerances import assert_close
+from tests.tolerances import assert_close, assert_equal
 from tests.trainer_support import OFTEN, TEXTURE, assert_resumed_alike, assert_same_state, rescaled, small, trained
 
 
@@ -63,9 +63,7 @@ def test_deterministic_runs_are_the_same_on_cuda(scene):
     first, *others = (trainer.finish() for trainer in runs)
     assert first.exposures is not None and first.detail_limits is not None
     for model in others:
-        assert model.state_dict().keys() == first.state_dict().keys()
-        for name, value in first.state_dict().items():
-            assert torch.equal(model.state_dict()[name], value), name
+        assert_equal(model.state_dict(), first.state_dict())
 
 
 def test_it_learns(scene):
