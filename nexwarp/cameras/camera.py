@@ -129,11 +129,7 @@ class Camera:
         return Camera(viewmat, K, self.width, self.height, self.near, origin=self.origin, checked=checked)
 
     def moved(self, origin: tuple[float, float, float]) -> "Camera":
-        """Return the same camera in the frame with another origin in world coordinates, computed in float64.
-
-        Raises:
-            ValueError: the camera has no origin of its own.
-        """
+        """Return the camera in the frame with another origin in world coordinates; ValueError if it has no `origin`."""
         if self.origin is None:
             raise ValueError("origin: expected the world coordinates of the camera's frame, got None")
         viewmat = self.viewmat.double()

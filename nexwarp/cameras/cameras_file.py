@@ -82,11 +82,7 @@ def _file_name(name: str) -> str:
 
 
 def origin_of(data: Mapping[str, object]) -> tuple[float, float, float] | None:
-    """Read the key `origin` of a model's or a file's frame; None where there is none.
-
-    Raises:
-        ValueError: it is not three finite numbers.
-    """
+    """Read the key `origin` of a model's or a file's frame, three finite numbers; None where there is none."""
     values = data.get("origin")
     if values is None:
         return None

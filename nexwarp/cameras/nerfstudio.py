@@ -52,10 +52,7 @@ def save_transforms(
 
     Each frame has its own intrinsics, so that sizes may differ. `lenses` has for some names the keys of a distorted
     lens, with its `camera_model`, in place of the camera's intrinsics. `train` are the names for `train_filenames`,
-    `test` those for `val_filenames` and `test_filenames`; if both are None, no split is written.
-
-    Raises:
-        ValueError: no cameras; OSError: `path` cannot be written.
+    `test` those for `val_filenames` and `test_filenames`; if both are None, no split is written. ValueError: none.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one, got none")
@@ -79,11 +76,7 @@ def save_camera_path(path: str | os.PathLike[str], cameras: Sequence[Camera], fp
 
     nerfstudio's entries hold a vertical field of view only; they imply square pixels and a centred principal point. For
     other cameras the focal lengths and principal point are added as `fl_x`, `fl_y`, `cx`, `cy`, which nexwarp reads and
-    nerfstudio ignores.
-
-    Raises:
-        ValueError: no cameras, cameras of several sizes, `fps` (frames a second) not > 0; OSError: `path` cannot be
-            written.
+    nerfstudio ignores. ValueError: no cameras, cameras of several sizes, `fps` (frames a second) not > 0.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one, got none")
@@ -123,11 +116,7 @@ def load_camera_path(
     """Read a camera path of nerfstudio's viewer.
 
     The cameras are float32 on the CPU, with the near depth `near` in world units, in the frame whose origin has the
-    world coordinates `origin`, such as `Model.origin`.
-
-    Raises:
-        FileNotFoundError: no such file. ValueError: a key is missing or has an invalid value; the message names the
-            frame and key.
+    world coordinates `origin`, such as `Model.origin`. ValueError names a key that is missing or has an invalid value.
     """
     path = Path(path)
     if not path.is_file():

@@ -65,10 +65,8 @@ def through(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
     """Return `count` cameras on a smooth path that passes through all of the given ones, from the first to the last.
 
     The time between two cameras is proportional to their distance and rotation. Centres follow a cubic spline,
-    rotations one of continuous angular acceleration. All else is that of the first camera.
-
-    Raises:
-        ValueError: fewer than two distinct cameras, or `count` < 1.
+    rotations one of continuous angular acceleration. All else is that of the first camera. ValueError: fewer than two
+    distinct cameras, or `count` < 1.
     """
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, RotationSpline
@@ -90,10 +88,8 @@ def interpolate(cameras: Sequence[Camera], count: int = 120) -> list[Camera]:
 
     Centres and viewing directions are means of those of neighbours in the list, under a Gaussian window of 2 cameras
     (a tenth of the list if that is less). The path takes time in proportion to distance and turn. Its cameras are
-    upright as `up_direction`; all else is that of the first camera.
-
-    Raises:
-        ValueError: fewer than two distinct cameras, a path that looks straight up or down, or `count` < 1.
+    upright as `up_direction`; all else is that of the first camera. ValueError: fewer than two distinct cameras, a path
+    that looks straight up or down, or `count` < 1.
     """
     from scipy.interpolate import CubicSpline
     from scipy.ndimage import gaussian_filter1d

@@ -12,17 +12,11 @@ from nexwarp.cameras.paths import up_direction
 
 @dataclass(frozen=True)
 class Similarity:
-    """A motion to other coordinates: a point x goes to scale * rotation @ x + shift.
+    """A motion to other coordinates: a point x goes to scale * rotation @ x + shift."""
 
-    Attributes:
-        rotation: (3, 3) float64, with determinant 1.
-        shift: (3,) float64, in the new units.
-        scale: new units in an old one, > 0.
-    """
-
-    rotation: np.ndarray
-    shift: np.ndarray
-    scale: float = 1.0
+    rotation: np.ndarray  # (3, 3) float64, with determinant 1
+    shift: np.ndarray  # (3,) float64, in the new units
+    scale: float = 1.0  # new units in an old one, > 0
 
     @property
     def is_identity(self) -> bool:

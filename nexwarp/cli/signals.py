@@ -21,9 +21,7 @@ def stopped_by_signals(*, deferred: bool = False) -> Iterator[Callable[[], int |
 
     `deferred`, the first signal is only recorded, so that a training can stop between two steps. An ignored SIGHUP, as
     after `nohup`, stays ignored. Other threads than the main one get no signals: there the block runs without handlers.
-
-    Yields:
-        A function that returns the number of the first signal, or None.
+    Yield a function that returns the number of the first signal, or None.
     """
     received: list[int] = []
 

@@ -57,17 +57,11 @@ class ImageRecord(NamedTuple):
 
 @dataclass(frozen=True)
 class PointRecords:
-    """Points by ascending id.
+    """Points by ascending id."""
 
-    Attributes:
-        table: (P,) of `POINTS`: world positions, colours, mean reprojection errors in pixels, numbers of observations.
-        seen_by: (E,) uint32, image ids of the observations, in the order of `points`.
-        points: (E,) int32, index of the point of each observation.
-    """
-
-    table: np.ndarray
-    seen_by: np.ndarray
-    points: np.ndarray
+    table: np.ndarray  # (P,) of `POINTS`: world positions, colours, mean errors in pixels, numbers of observations
+    seen_by: np.ndarray  # (E,) uint32, image ids of the observations
+    points: np.ndarray  # (E,) int32, index of the point of each observation
 
 
 def _folders(path: Path) -> list[Path]:
@@ -115,12 +109,9 @@ def _find_model(path: Path, need_points: bool) -> tuple[Path, str, Path | None]:
 def read_model(path: Path, images: Path, follow_links: bool = False, need_points: bool = True) -> Capture:
     """Read the COLMAP model of a scene in `path`, whose photos lie in `images`.
 
-    With `need_points` a model without a file of points is refused; one of no points is accepted.
-
-    Raises:
-        FileNotFoundError: there is no complete model; the message names the missing files of a partial one.
-        ValueError: the model is damaged, has no registered image, an invalid camera or pose, an image name that leaves
-            the images folder or occurs twice, or points that are not finite.
+    With `need_points` a model without a file of points is refused; one of no points is accepted. FileNotFoundError:
+    there is no complete model. ValueError: it is damaged, has no registered image, an invalid camera or pose, an image
+    name that leaves the images folder or occurs twice, or points that are not finite.
     """
     folder, suffix, points_file = _find_model(path, need_points)
     in_ply = points_file is not None and points_file.name == POINTS_PLY

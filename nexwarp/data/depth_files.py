@@ -49,9 +49,7 @@ def read_depth(path: Path) -> torch.Tensor:
     """Read a depth map (H, W) float16; what is not above 0, or above 65,504, is unknown and becomes 0.
 
     A PNG file has 8 or 16 bits a pixel in millimetres, which become metres. Numbers of others stay as they are.
-
-    Raises:
-        ValueError: a file that is damaged, of another kind or of more than one channel, has NaN, or no depth.
+    ValueError: a file that is damaged, of another kind or of more than one channel, has NaN, or no depth.
     """
     try:
         if path.suffix.lower() == ".png":

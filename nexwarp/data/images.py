@@ -168,11 +168,8 @@ def read_image(path: Path, white: float | None = None) -> torch.Tensor:
 
     With `white` the file holds linear light, of which this value becomes white; what is brighter is clipped. The
     largest number of 8 or 16 bits a channel is 1. OpenEXR files hold linear light always, with a `white` of 1 if None.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file cannot be decoded, is truncated, holds numbers of unknown range (floats, signed or 32-bit
-            integers), or has more than 178 megapixels; or PyAV is missing for a PNG or TIFF file of linear light.
+    ValueError: the file cannot be decoded, is truncated, holds numbers of unknown range (floats, signed or 32-bit
+    integers), or has more than 178 megapixels; or PyAV is missing for a PNG or TIFF file of linear light.
     """
     if white is None and path.suffix.lower() != EXR:
         with _loaded(path) as image:
@@ -192,8 +189,7 @@ def read_image(path: Path, white: float | None = None) -> torch.Tensor:
 def copy_upright(path: Path, target: Path) -> torch.Tensor:
     """Write an upright copy of a photo, in the format of the target's suffix, and return its (H, W, 3) uint8 pixels.
 
-    The copy keeps of EXIF the camera and how it was set (focal length). Errors are those of `read_image`; OSError:
-    `target` cannot be written.
+    The copy keeps of EXIF the camera and how it was set (focal length). Errors are those of `read_image`.
     """
     from PIL import Image
 

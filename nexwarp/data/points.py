@@ -15,19 +15,12 @@ NORMAL_NEIGHBORS = 12
 
 @dataclass(frozen=True)
 class InitialPoints:
-    """Points in the order of farthest point sampling: every prefix covers the scene evenly.
+    """Points in the order of farthest point sampling: every prefix covers the scene evenly; all float32."""
 
-    Attributes:
-        means: (M, 3) float32, world frame.
-        colors: (M, 3) float32, sRGB in [0, 1].
-        scales: (M,) float32, world units, > 0.
-        normals: (M, 3) float32 unit normals of the planes fitted to each point's 12 nearest points; of either sign.
-    """
-
-    means: torch.Tensor
-    colors: torch.Tensor
-    scales: torch.Tensor
-    normals: torch.Tensor
+    means: torch.Tensor  # (M, 3), world frame
+    colors: torch.Tensor  # (M, 3), sRGB in [0, 1]
+    scales: torch.Tensor  # (M,), world units, > 0
+    normals: torch.Tensor  # (M, 3), unit, of the planes fitted to each point's 12 nearest points; of either sign
 
     def joined(self, other: "InitialPoints") -> "InitialPoints":
         """Return these points, followed by others."""

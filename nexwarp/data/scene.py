@@ -107,11 +107,7 @@ class SceneSource:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "SceneSource":
-        """Rebuild it from `dataclasses.asdict`; what a newer version added is passed over.
-
-        Raises:
-            TypeError, ValueError: naming a field of another type.
-        """
+        """Rebuild it from `dataclasses.asdict`; what a newer version added is passed over. TypeError names a field."""
         known = {field.name for field in dataclasses.fields(cls)}
         values = {name: value for name, value in data.items() if name in known}
         if isinstance(exclude := values.get("exclude"), list):  # of JSON

@@ -73,12 +73,7 @@ class _Frames:
 
 
 def read_nerfstudio(path: Path, images: str, follow_links: bool = False, skip_missing: bool = False) -> Capture:
-    """Read `transforms.json` of the scene in `path`; `images` replaces "images" in the file.
-
-    Raises:
-        FileNotFoundError: a photo, a mask or the points that the file names do not exist.
-        ValueError: the file has invalid content; the message names the place.
-    """
+    """Read `transforms.json` of the scene in `path`; `images` replaces "images" in the file."""
     frames = _read_frames(path / NERFSTUDIO_FILE, images, follow_links, skip_missing)
     report_unused(frames.file, path / images, frames.photos)
     photos, test = _split(frames)

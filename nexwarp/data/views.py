@@ -91,24 +91,16 @@ class PlannedView:
     target: Intrinsics  # after undistortion, before the reduction
 
 
+@dataclass
 class ViewReader:
-    """Reads views; thread-safe.
+    """Reads views; thread-safe."""
 
-    Args:
-        downscale: reduce images by this factor, averaging blocks of pixels.
-        background: colour behind transparent photos; None drops their alpha.
-        alpha_mask: use alpha >= 128 as the mask.
-        white: as of `read_image`.
-    """
+    downscale: int  # factor by which images are reduced, averaging blocks of pixels
+    background: tuple[float, float, float] | None  # behind transparent photos; None drops their alpha
+    alpha_mask: bool  # use alpha >= 128 as the mask
+    white: float | None = None  # as of `read_image`
 
-    def __init__(
-        self,
-        downscale: int,
-        background: tuple[float, float, float] | None,
-        alpha_mask: bool,
-        white: float | None = None,
-    ) -> None:
-        self.downscale, self.background, self.alpha_mask, self.white = downscale, background, alpha_mask, white
+    def __post_init__(self) -> None:
         self._maps, self._lock = lru_cache(KEPT_MAPS)(undistortion), Lock()
 
     def plan(self, photo: Photo) -> list[PlannedView]:

@@ -64,10 +64,7 @@ def written_aside(path: str | os.PathLike[str], *, durable: bool = True) -> Iter
 
     Missing folders are created. If the block fails, an existing file at `path` stays unchanged, and the temporary file
     and the folders created for it are removed. Unless `durable`, it does not wait until the disk has stored the file: a
-    power failure can leave an empty one.
-
-    Raises:
-        OSError: the folder cannot be created or written to, or `path` is a folder. StorageError: the disk is full.
+    power failure can leave an empty one. OSError: the folder cannot be created or written to, or `path` is a folder.
     """
     path = Path(path)
     if path.is_dir():

@@ -140,10 +140,9 @@ def crop_command(opened: OpenedModel, centre: np.ndarray, radius: float) -> str:
 
 
 def measured(opened: OpenedModel, points: np.ndarray, length: float) -> list[str]:
-    """Return lines, in Markdown, on one or two points (N, 3) in the frame of a run's cameras.
+    """Return lines, in Markdown, on one or two points (N, 3) in the frame of a run's cameras, in that of exports.
 
-    They have the points in the coordinates of exports and, of two, the distance there and the command that makes it
-    `length`, in the unit of exports.
+    Of two, they have the distance and the command that makes it `length`.
     """
     places = opened.frame.points(points)
     texts = [" ".join(f"{x:.6g}" for x in place) for place in places]

@@ -74,9 +74,6 @@ def evaluate(
             from the photo.
         progress: called with each view's name after the view is evaluated.
         ranks: share the views, and return the same on all of them; only rank 0 writes. None is this process alone.
-
-    Raises:
-        ValueError: there are no views, or a metric is unknown.
     """
     if not views:
         raise ValueError("views: expected at least one view to evaluate, got none")

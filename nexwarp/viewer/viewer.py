@@ -297,9 +297,7 @@ def _reason(error: Exception) -> str:
 def start_server(host: str, port: int) -> tuple["viser.ViserServer", str, "Gate"]:
     """Start viser on exactly this address; return it, the address to open, with a token if it needs one, and its gate.
 
-    The gate admits requests by the rules of security.py, none until `is_open` is set.
-
-    ValueError: viser is not installed, or the address cannot be used; the message gives the reason.
+    The gate admits requests by the rules of security.py, none until `is_open` is set. Errors are of `check_server`.
     """
     address = check_server(host, port)
     import viser

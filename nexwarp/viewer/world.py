@@ -29,16 +29,12 @@ FloatVector: TypeAlias = Sequence[float] | npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class World:
-    """The browser's frame: the scene's frame, translated and scaled so that all cameras lie within `RADIUS`.
+    """The browser's frame: the scene's frame, translated and scaled so that all cameras lie within `RADIUS`."""
 
-    Its origin `centre`, unit upward direction `up`, and the `focus` that the first camera orbits are (3,) in the
-    scene's frame; `unit` is the length of a browser unit there.
-    """
-
-    centre: np.ndarray
-    unit: float
-    up: np.ndarray
-    focus: np.ndarray
+    centre: np.ndarray  # (3,) its origin, in the scene's frame, as `up` and `focus`
+    unit: float  # length of a browser unit
+    up: np.ndarray  # (3,) unit upward direction
+    focus: np.ndarray  # (3,) what the first camera orbits
 
     @staticmethod
     def around(cameras: Sequence[Camera], means: torch.Tensor) -> "World":
@@ -70,14 +66,11 @@ class World:
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """The camera of a browser's canvas, whose size is in pixels.
+    """The camera of a browser's canvas."""
 
-    `pose` is (4, 4) float64, camera to world in the scene's frame, x right, y down, z forward; `fov` is vertical, rad.
-    """
-
-    pose: np.ndarray
-    fov: float
-    width: int
+    pose: np.ndarray  # (4, 4) float64, camera to world in the scene's frame, x right, y down, z forward
+    fov: float  # vertical, radians
+    width: int  # pixels
     height: int
 
     @staticmethod

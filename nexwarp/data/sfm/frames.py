@@ -90,11 +90,8 @@ def take_frames(
 
     A frame is left out if it is much less sharp than its neighbours, or nearly the same as the one before. The files
     are frame_NUMBER.jpg. The video is decoded twice, so that no frame is kept in memory. `observe` is called with the
-    stage's name, the number of frames read and their total, which is not known before.
-
-    Raises:
-        FormatError: the file is no video, or is damaged.
-        SceneError: fewer than 3 frames are left.
+    stage's name, the number of frames read and their total, which is not known before. FormatError: the file is no
+    video, or is damaged. SceneError: fewer than 3 frames are left.
     """
     scores: list[float] = []
     seconds = 0.0

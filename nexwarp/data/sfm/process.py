@@ -66,9 +66,6 @@ def process(
 ) -> SfmReport:
     """Estimate the cameras and points of a video or of photos, and write a COLMAP scene for `load_scene`.
 
-    Of a video, `take_frames` takes sharp frames that differ, which are then compared with their neighbours in time
-    only, unless the options say otherwise. Of photos all that can be read are used, turned upright by EXIF.
-
     The scene holds images/ (undistorted, with the given names), sparse/0 (PINHOLE cameras) and sfm.json (the report
     and the options). It is made in a folder beside `scene`, and renamed at the end. A failure or interruption leaves
     nothing, and so does the end of this process.
@@ -80,17 +77,10 @@ def process(
         options: settings; None is the defaults.
         observe: called repeatedly with the stage's name, the number of finished items and their total.
 
-    Returns:
-        The report.
-
     Raises:
-        FileNotFoundError: no such `source`.
-        FileExistsError: `scene` exists.
-        ValueError: an option out of range, fewer than 3 photos that can be read, a photo that cannot (`strict`), has a
-            name that no scene can have, or is a link out of the folder, photos of one camera that differ in size,
-            a video that is damaged or shows fewer than 3 sharp frames, or no model was found; then the message gives
-            advice.
-        StorageError: the disk is full.
+        OSError: no such `source`; `scene` exists; the disk is full.
+        ValueError: an option out of range, photos or a video that cannot be used, or no model was found; then the
+            message gives advice.
         MemoryError: a photo needs more memory than there is.
     """
     source, scene, options = Path(source), Path(scene), options or SfmOptions()
