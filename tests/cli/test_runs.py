@@ -1,6 +1,7 @@
 import csv
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +11,14 @@ from scipy.ndimage import gaussian_filter
 
 import nexwarp as nw
 from nexwarp.cli import main as cli
+from nexwarp.data import load_scene
 from nexwarp.io.pictures import to_uint8
 from nexwarp.run.evaluate import CONVENTION, psnr
-from nexwarp.run.folder import list_files
+from nexwarp.run.folder import list_files, read_run
 from nexwarp.run.photo_table import save_photo_table
+from nexwarp.train.optimizer import set_rates
 from nexwarp.train.recipe import config_from_dict
+from nexwarp.train.trainer import Trainer
 from tests.cli.support import FLAGS, RUN_FILES, SMALL, picture, read, refused, snapshot
 from tests.data.test_scene import make_scene
 from tests.scene_writers import write_blender, write_points
@@ -162,3 +166,52 @@ def test_other_cameras_render_beside_the_photos(finished):
     assert cli.main(["render", str(finished), *options, "--camera", "fisheye", "--scale", "0.5"]) == 0
     assert picture(finished / "renders" / "fisheye" / "ellipse" / "0001.png").shape == (18, 18, 3)
     assert list_files(finished)[1] == []
+
+
+# A run that is continued beyond its end
+
+
+@pytest.fixture(scope="module")
+def extended(trained: Path, scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of 20 iterations, continued to 30."""
+    run = Path(shutil.copytree(trained, tmp_path_factory.mktemp("extended") / "run"))
+    assert cli.main(["train", str(scene), "--run", str(run), "--device", "cpu", "--resume", "--iterations", "30"]) == 0
+    return run
+
+
+def test_a_finished_run_goes_on(extended: Path, scene: Path) -> None:
+    assert read_run(extended).config.iterations == 30 and read(extended, "metrics.json")["iterations"] == 30
+    logged = [json.loads(line)["iteration"] for line in (extended / "metrics.jsonl").read_text().splitlines()]
+    assert logged == list(range(1, 31))
+    # Finished once more, and as before, by another --resume.
+    before = (extended / "model.safetensors").read_bytes()
+    assert cli.main(["train", str(scene), "--run", str(extended), "--device", "cpu", "--resume"]) == 0
+    assert (extended / "model.safetensors").read_bytes() == before
+
+
+def test_it_is_said_and_an_interruption_changes_nothing(extended, trained, scene, tmp_path, capsys):
+    """Interrupted before its first new checkpoint, an extended run is resumed without --iterations."""
+    run = Path(shutil.copytree(trained, tmp_path / "run"))
+    command = ["train", str(scene), "--run", str(run), "--device", "cpu", "--resume"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Trainer, "step", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
+        assert cli.main([*command, "--iterations", "30"]) == 130
+    told = capsys.readouterr().out.replace("\n", " ")
+    assert "extended from 20 to 30 iterations: from here on, learning rates" in told and cli.main(command) == 0
+    assert "extended" not in capsys.readouterr().out
+    assert (run / "model.safetensors").read_bytes() == (extended / "model.safetensors").read_bytes()
+
+
+def test_its_schedules_are_those_of_the_longer_run(trained: Path, scene: Path) -> None:
+    config = read_run(trained).config
+    longer = type(config)(**{**vars(config), "iterations": 30})
+    trainer = Trainer(load_scene(scene), longer, "cpu")
+    with pytest.raises(ValueError, match="its settings are others"):
+        trainer.restore(trained)
+    trainer.restore(trained, extend=True)
+    assert trainer.iteration == 20
+    trainer.step()
+    rates = [group["lr"] for group in trainer.optimizer.param_groups]
+    set_rates(trainer.optimizer, 21, 30)
+    assert rates == [group["lr"] for group in trainer.optimizer.param_groups]
+    assert trainer.densifier.config == Trainer(load_scene(scene), longer, "cpu").densifier.config

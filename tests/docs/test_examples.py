@@ -1,6 +1,7 @@
 import re
 from pathlib import Path
 
+import nbformat
 import numpy as np
 import pytest
 import torch
@@ -10,6 +11,7 @@ import nexwarp as nw
 from nexwarp.cameras.cameras_file import save_cameras
 from nexwarp.data import Scene
 from nexwarp.train.recipe import LearningRates, TextureConfig
+from notebooks.__main__ import FOLDER, NAMES, pictures, sources
 from tests.subprocesses import ROOT, run_python
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -124,3 +126,20 @@ def test_a_scene_is_logged_to_rerun(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
     run("rerun_scene", "--out", tmp_path / "scene.rrd")
     assert (tmp_path / "scene.rrd").stat().st_size > 10_000
+
+
+HERE = re.compile(r"/(home|root|tmp|work|Users)/")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_outputs_are_kept_and_those_of_the_cells(name: str) -> None:
+    """`python -m notebooks NAME` makes them anew."""
+    notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+    nbformat.validate(notebook)
+    assert notebook.metadata["sources"] == sources(notebook), "cells were changed after the last execution"
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1)) and sum(pictures(notebook)) >= 3
+    for output in (output for cell in cells for output in cell.outputs):
+        assert output.output_type != "error" and output.get("name") != "stderr"
+        text = output.get("text", "") + output.get("data", {}).get("text/plain", "")
+        assert not HERE.search(text), f"a path of one machine: {text}"
