@@ -30,13 +30,22 @@ FEWEST = 8  # texels along an axis: alpha varies over every quad
 
 
 def bake_cards(
-    model: Model, views: Views, alpha: str = "mask", *, steps: int | None = None, progress: Progress = lambda *_: None
+    model: Model,
+    views: Views,
+    alpha: str = "mask",
+    *,
+    aim: Model | None = None,
+    steps: int | None = None,
+    progress: Progress = lambda *_: None,
 ) -> BakedScene:
-    """Bake a model into cards, fitted to the views' photos, or for cameras to the model's renderings; see `bake`."""
+    """Bake a model into cards, fitted to the views' photos, or for cameras to the renderings of `aim`; see `bake`.
+
+    `aim` is the model itself, or a better one of the same scene, whose colours may depend on the direction.
+    """
     cards = make_cards(measure(model, views, progress), alpha)
     if not len(cards.shape.means):
         return cards
-    return fit(cards, model, views, steps, partial(progress, "baking the texture"))
+    return fit(cards, aim or model, views, steps, partial(progress, "baking the texture"))
 
 
 @torch.no_grad()

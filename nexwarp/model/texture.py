@@ -227,6 +227,16 @@ class NeuralTexture(Texture):
         """Device of the parameters."""
         return self.grid.device
 
+    def up_to(self, sh_degree: int) -> "NeuralTexture":
+        """Return a copy whose colours have SH up to a degree at most: others are dropped."""
+        degree = min(sh_degree, self.sh_degree)
+        shape: TextureShape = {**self.config, "sh_degree": degree}
+        other, state = NeuralTexture(**shape), self.state_dict()
+        last = list(state)[-1]
+        other.load_state_dict(state | {last: state[last][: 3 * (degree + 1) ** 2]})
+        other.half_precision = self.half_precision
+        return other.to(self.device)
+
     def stored_per_point(self, sh_degree: int) -> tuple[int, torch.dtype]:
         """Return how many values an evaluation up to an SH degree keeps for each point, at least, and their dtype.
 

@@ -16,14 +16,14 @@ from nexwarp.cameras.camera import Camera, resized
 from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.nerfstudio import save_camera_path, save_transforms
 from nexwarp.cameras.similarity import IDENTITY
-from nexwarp.data import View
+from nexwarp.data import Scene, View
 from nexwarp.data.images import image_size
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import DEMO, SceneSource, demo_folder, parse_color
 from nexwarp.data.transforms import lens_keys
 from nexwarp.errors import RunError, SettingError
 from nexwarp.export.bake import Progress
-from nexwarp.export.baked_scene import GLB, load_baked
+from nexwarp.export.baked_scene import GLB, BakedScene, load_baked
 from nexwarp.export.fit import Views
 from nexwarp.export.glb import ALPHAS, bake_cards, save_glb
 from nexwarp.export.mesh import Mesh, extract_mesh, save_mesh
@@ -48,7 +48,9 @@ from nexwarp.model.model_file import save_model
 from nexwarp.run.edit import MIDDLE, edited, subject_crop
 from nexwarp.run.evaluate import compared, lpips_vgg, psnr, ssim, weights_file
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, METRICS_FILE, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
-from nexwarp.train.recipe import MASK_MODES
+from nexwarp.train.api import train
+from nexwarp.train.recipe import DEFAULT, MASK_MODES, MIN_SURFELS, with_settings
+from nexwarp.train.report import StepReport
 
 # Packages that formats need, and their extras.
 PACKAGES = {"glb": ("trimesh", "glb"), "spz": ("gaussforge", "splats"), "usd": ("pxr", "usd")}
@@ -64,6 +66,7 @@ OPTIONS = {
 }
 Figures = dict[str, dict[str, float]]  # metrics on test views, of what was baked and of the model
 GREY_LEVEL = 1 / 255
+DIFFUSE_SHARE = 1 / 4  # of a run's iterations, for which its model is trained with one colour from all directions
 COLLISION_VOXELS = 48  # along the scene's longest side
 FAR_AROUND = 10.0  # so many times the subject, what lies around an object is left out
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows
@@ -151,12 +154,12 @@ def export_run(
     if order.crop and order.format in CARDS:
         opened = _cropped(opened, report)
     fitted = order.format in BAKED and order.finetune and opened.source is not None
-    train, test = _photos(opened, device, observe) if fitted else ([], [])
-    files = [*_export(opened, order, folder, train, device, observe)]
+    scene = _photos(opened, device, observe) if fitted else None
+    files = [*_export(opened, order, folder, scene, device, observe)]
     beside = folder.parent if folder.suffix == ".html" else folder
-    if test and order.format in READ:
-        figures, size = _quality(opened, files, test, device), sum(file.stat().st_size for file in files)
-        report(_line(figures, len(test), size, _is_cropped(opened)))
+    if scene is not None and scene.test and order.format in READ:
+        figures, size = _quality(opened, files, scene.test, device), sum(file.stat().st_size for file in files)
+        report(_line(figures, len(scene.test), size, _is_cropped(opened)))
         known = read_metrics(beside).get("exports")
         files.append(beside / METRICS_FILE)
         entry = cast(JsonObject, {**figures, "cropped": _is_cropped(opened)})
@@ -193,7 +196,7 @@ def _export(
     opened: OpenedModel,
     order: ExportOrder,
     folder: Path,
-    photos: Sequence[View],
+    scene: Scene | None,
     device: torch.device | str,
     observe: Progress,
 ) -> Sequence[Path]:
@@ -204,7 +207,7 @@ def _export(
     if order.format not in ("compact", "mesh", "cameras") and (opened.folder / CAMERAS_FILE).is_file():
         views = {name: camera for members in opened.cameras.values() for name, camera in members.items()}
     # What is baked learns from no test view, not even from its pose.
-    seen: Views = photos or ([*opened.cameras.get(TRAIN, {}).values()] if views else [])
+    seen: Views = scene.train if scene is not None else [*opened.cameras.get(TRAIN, {}).values()] if views else []
     if order.format == "web":
         model, out, page = opened.model.to(device), order.out or files[0], _page(opened, order)
         return export_web(model, views, out, seen, quality=order.quality, page=page, progress=observe)
@@ -221,7 +224,14 @@ def _export(
     elif order.format == "compact":
         save_model(files[0], opened.model, compact=_noise(opened) if order.noise is None else order.noise)
     else:
-        _export_geometry(opened, order, files, list(views.values()), seen, device, observe)
+        cards = None
+        if order.format in CARDS:
+            if not views:
+                raise RunError(f"{opened.path}: --format {order.format}: expected the run's {CAMERAS_FILE}, found none")
+            aim = opened.model.to(device)
+            model = aim if scene is None else _diffuse(opened, scene, device, observe)
+            cards = bake_cards(model, seen or [*views.values()], order.alpha, aim=aim, progress=observe)
+        _export_geometry(opened, order, files, list(views.values()), cards, device, observe)
     return files
 
 
@@ -242,7 +252,7 @@ def _export_geometry(
     order: ExportOrder,
     files: Sequence[Path],
     cameras: list[Camera],
-    seen: Views,
+    cards: BakedScene | None,
     device: torch.device | str,
     observe: Progress,
 ) -> None:
@@ -250,10 +260,7 @@ def _export_geometry(
     motion, degree = opened.frame, min(opened.model.options.sh_degree, SPLAT_DEGREE)
     surfels = moved_surfels(opened.model.surfels, motion)
     moved = [motion.camera(camera) for camera in cameras]
-    if order.format in ("glb", "usd"):
-        if not cameras:
-            raise RunError(f"{opened.path}: --format {order.format}: expected the run's {CAMERAS_FILE}, found none")
-        cards = bake_cards(opened.model.to(device), seen or cameras, order.alpha, progress=observe)
+    if cards is not None:
         means, quats = moved_poses(cards.shape.means, cards.shape.quats, motion)
         shape = cards.shape._replace(means=means, quats=quats, scales=cards.shape.scales * motion.scale)
         cards = replace(cards, shape=shape)
@@ -283,28 +290,46 @@ def _collision(opened: OpenedModel, device: torch.device | str, observe: Progres
     return mesh.moved(opened.frame)
 
 
-def _photos(opened: OpenedModel, device: torch.device | str, observe: Progress) -> tuple[list[View], list[View]]:
-    """Read the training photos, with the run's poses, and the test photos of a run; none where that is impossible.
+def _diffuse(opened: OpenedModel, scene: Scene, device: torch.device | str, observe: Progress) -> Model:
+    """Train a run's model on, with one colour from all directions, as cards have it; no surfel is added."""
+    before, config = opened.model, opened.config or DEFAULT
+    iterations = max(round(DIFFUSE_SHARE * config.iterations), 1)
+    settings: dict[str, object] = dict.fromkeys(("sh_degree", "teachers", "smooth_sh"), 0)
+    settings |= {"densify.fraction": 0.0, "densify.relocate": 0.0, "refine_poses": False, "mask_mode": MASK_MODES[0]}
+    settings |= {"exposures": before.exposures is not None, "max_surfels": max(len(before.surfels), MIN_SURFELS)}
+    config = with_settings(config, settings | {"iterations": iterations, "steps_a_photo": None})
 
-    Their masks leave out what a crop has changed.
+    def report(step: StepReport) -> None:
+        observe("training with one colour from all directions", step.iteration, iterations)
+
+    model = train(scene, config, device=device, init=before, callbacks=[report])
+    model.exposures = None if before.exposures is None else before.exposures.to(device)
+    return model
+
+
+def _photos(opened: OpenedModel, device: torch.device | str, observe: Progress) -> Scene | None:
+    """Read the scene of a run, its training views with the run's poses; None where that is impossible.
+
+    Masks leave out what a crop has changed.
     """
     assert opened.source is not None
     try:
         scene = opened.source.load(lambda done, total: observe("reading photos", done, total))
     except (OSError, ValueError, MemoryError) as error:
         warnings.warn(f"the photos cannot be read ({one_line(error)}), so nothing is fitted to them", stacklevel=2)
-        return [], []
+        return None
     mode = MASK_MODES[0] if opened.config is None else opened.config.mask_mode
     groups = []
     for views in (scene.train, scene.test):
         shown = [(view, *compared(opened.model, view, mode)) for view in views]
-        groups.append([replace(view, image=image, mask=mask) for view, image, mask in shown])
+        groups.append([replace(view, image=image, mask=mask, alpha=None) for view, image, mask in shown])
     cameras = opened.cameras.get(TRAIN, {}) if (opened.folder / CAMERAS_FILE).is_file() else {}
     groups[0] = [replace(view, camera=cameras.get(view.name, view.camera)) for view in groups[0]]
     if _is_cropped(opened):
         models = [model.bare().to(device) for model in (opened.trained, opened.model)]
         groups = [[_masked(view, *models) for view in group] for group in groups]
-    return groups[0], [view for view in groups[1] if view.mask is None or view.mask.any()]
+    test = [view for view in groups[1] if view.mask is None or view.mask.any()]
+    return replace(scene, train=groups[0], test=test, random_background=False)
 
 
 def _masked(view: View, whole: Model, part: Model) -> View:

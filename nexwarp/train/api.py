@@ -47,8 +47,8 @@ def train(
             device. Every other step compares with a rendering of one, at the mean exposure, from a camera on the line
             through those of two photos.
         start: `surfels`: surfels to start from instead of the scene's points, at most `config.max_surfels`, in the
-            scene's frame; SH coefficients above `config.sh_degree` are dropped. `init`: a model of the scene to start
-            from, with its texture. `texture`: a `Texture` of your own, which is trained in place; or a class or
+            scene's frame. `init`: a model of the scene to start from, with its texture. SH coefficients of both above
+            `config.sh_degree` are dropped. `texture`: a `Texture` of your own, which is trained in place; or a class or
             function that makes one, the class without arguments, the function of the scene and the initial surfels.
             Its parameters are trained as the group "texture" at its `rates`, and its `regulariser` is added to the
             loss. Teachers that the run trains for itself start as ever.

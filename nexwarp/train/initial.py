@@ -90,7 +90,8 @@ def initial_texture(scene: Scene, config: Config, surfels: Surfels, start: Start
     elif texture is not None and not isinstance(texture, Texture):
         texture = texture(scene, surfels)
     if texture is None and init is not None and config.max_hits:
-        texture = copy.deepcopy(init.texture)
+        given = init.texture
+        texture = given.up_to(config.sh_degree) if isinstance(given, NeuralTexture) else copy.deepcopy(given)
     if texture is None:
         return NeuralTexture(**texture_shape(scene, config))
     if not isinstance(texture, Texture):

@@ -8,11 +8,13 @@ import pytest
 import torch
 from PIL import Image, ImageOps
 
+import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.data.ply import read_vertices
 from nexwarp.export.baked_scene import load_baked
 from nexwarp.export.web import baked
-from nexwarp.run.export import ExportOrder, _photos, export_run
+from nexwarp.run.evaluate import psnr
+from nexwarp.run.export import ExportOrder, _diffuse, _photos, export_run
 from nexwarp.run.folder import open_model, read_metrics
 from tests.cli.support import read, refused
 from tests.narrowing import present
@@ -115,7 +117,8 @@ def test_a_collision_mesh_is_in_the_exported_coordinates(finished, capsys, monke
 def test_a_cropped_export_learns_from_the_pixels_that_show_what_is_left(finished, tmp_path):
     assert cli.main(["edit", str(finished), "--crop", "sphere", "0", "0", "0", "6"]) == 0
     source = present(open_model(finished).source)
-    views = {view.name: view for group in _photos(open_model(finished), "cpu", lambda *_: None) for view in group}
+    photos = present(_photos(open_model(finished), "cpu", lambda *_: None))
+    views = {view.name: view for view in (*photos.train, *photos.test)}
     shares = [present(view.mask).double().mean().item() for view in views.values()]
     assert 0.2 < np.mean(shares) < 0.8
     results = {"as it is": baked_files(finished)}
@@ -131,6 +134,22 @@ def test_a_cropped_export_learns_from_the_pixels_that_show_what_is_left(finished
         results[inverted] = baked_files(finished, path=str(scene))
     assert results["beside"] == results["as it is"]
     assert results["inside"][0] != results["as it is"][0] and results["inside"][1] != results["as it is"][1]
+
+
+def test_cards_come_from_a_model_with_one_colour_from_all_directions(finished, monkeypatch):
+    """It is closer to the training photos than the run's own without its higher SH, and has no surfel more."""
+    monkeypatch.setattr("nexwarp.run.export.DIFFUSE_SHARE", 3)
+    opened, calls = open_model(finished), list[tuple[str, int, int]]()
+    photos = present(_photos(opened, "cpu", lambda *_: None))
+    model = _diffuse(opened, photos, "cpu", lambda *call: calls.append(call))
+    assert model.surfels.shN.shape[1] == 0 and present(model.texture).sh_degree == model.options.sh_degree == 0
+    assert len(model.surfels) <= len(opened.model.surfels) and calls[-1][1] == calls[-1][2] == len(calls)
+
+    def quality(shown: nw.Model) -> float:
+        images = [shown.render_image(view.camera, sh_degree=0) for view in photos.train]
+        return np.mean([psnr(x, view.image, view.mask) for x, view in zip(images, photos.train, strict=True)]).item()
+
+    assert quality(model) > quality(opened.model) + 0.5
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,12 @@ def test_a_training_starts_from_what_is_given(tiny_scene: Scene) -> None:
     assert all(torch.equal(getattr(from_model.surfels, name), getattr(first.surfels, name)) for name in PARAMETERS)
     assert isinstance(from_model.texture, nw.NeuralTexture)
     assert torch.equal(from_model.texture.grid, first.texture.grid) and from_model.texture is not first.texture
+    plainer = nw.Trainer(tiny_scene, dataclasses.replace(config, sh_degree=1), "cpu", init=first)
+    points, depths = torch.rand(9, 3), torch.rand(9)
+    assert torch.equal(plainer.surfels.sh, first.surfels.sh[:, :4])
+    with torch.no_grad():
+        degree_1, degree_3 = (texture(points, depths, 9.0) for texture in (plainer.texture, first.texture))
+    assert_close(degree_1, degree_3[:, :4], kind="value", name="texture of degree 1")
     from_surfels = nw.Trainer(tiny_scene, dataclasses.replace(config, sh_degree=1), "cpu", surfels=first.surfels)
     assert torch.equal(from_surfels.surfels.sh, first.surfels.sh[:, :4])
     back = nw.Trainer(tiny_scene, config, "cpu", surfels=from_surfels.surfels).surfels
