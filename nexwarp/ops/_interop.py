@@ -124,6 +124,8 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
     return view
 
 
+Kernel: TypeAlias = wp.Kernel | Callable[[type], wp.Kernel]  # one of each scalar type, see `kernels.types.per_real`
+
 # What a kernel or a struct declares: an array's elements, and the dimensions of a tensor that holds it; or a struct.
 Declared: TypeAlias = Any
 
@@ -262,7 +264,7 @@ if hasattr(os, "register_at_fork"):
 
 def launch(
     like: torch.Tensor,
-    kernel: wp.Kernel | Callable[[type], wp.Kernel],
+    kernel: Kernel,
     dim: int | tuple[int, int],
     inputs: Sequence[Argument],
     outputs: Sequence[Argument],

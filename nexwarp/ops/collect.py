@@ -8,20 +8,20 @@ import warp as wp
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.collect import collect_kernel
-from nexwarp.kernels.collect_backward import collect_backward_kernel, gradient_types, reduce_slots_kernel
+from nexwarp.kernels.collect_backward import collect_backward_kernel, reduce_slots_kernel
 from nexwarp.kernels.launch import Sharing
-from nexwarp.kernels.types import MAX_HITS, TileLists, types
+from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.native.staging import BLOCK_DIM
 from nexwarp.native.warp import tile_size_on
 from nexwarp.ops._interop import (
     Argument,
     Context,
+    Kernel,
     contiguous,
     first_derivative,
     from_fixed_point,
     launch,
     real_of,
-    struct,
     sums_in_fixed_point,
     sums_like,
 )
@@ -119,15 +119,13 @@ class Walked(NamedTuple):
         return real_of(self.records)
 
     def arguments(self) -> list[Argument]:
-        """The structs `Surfels`, `TileLists` and `View` of the kernels."""
-        t, tiles, camera = types(self.real), self.tiles, self.camera
-        surfels = {"records": self.records, "limits": self.limits, "reaches": tiles.reaches, "channels": self.channels}
-        lists = {name: getattr(tiles, name) for name in TileLists.vars}  # type: ignore[attr-defined]  # of a Warp struct
-        size = wp.vec2i(camera.width, camera.height)
-        view = struct(t.View, Ks=camera.K.contiguous(), size=size, tile_columns=tiles.columns, near=camera.near)
-        return [struct(t.Surfels, **surfels), struct(TileLists, **lists), view]
+        """The fields of the structs `Surfels`, `TileLists` and `View` of the kernels, in their order."""
+        tiles, camera = self.tiles, self.camera
+        lists = (tiles.surfel_ids, tiles.tile_offsets, tiles.order, tiles.ends)
+        view = (camera.K.contiguous(), wp.vec2i(camera.width, camera.height), tiles.columns, camera.near)
+        return [(self.records, self.limits, tiles.reaches, self.channels), lists, view]
 
-    def launch(self, kernel: wp.Kernel, arguments: list[Argument]) -> None:
+    def launch(self, kernel: Kernel, arguments: list[Argument]) -> None:
         """Launch a kernel over the pixels of all tiles, with these arguments behind those of `arguments`."""
         pixels = tile_size_on(self.records.is_cuda) ** 2  # of a tile
         threads = pixels * (len(self.tiles.tile_offsets) - 1)
@@ -161,8 +159,7 @@ class SlotSums:
         sums = {"records": self.records, "errors": self.errors, "channels": self.channels}
         if self.fixed_point:  # pairs of a surfel, one behind the other
             sums = {name: None if x is None else x.flatten(1) for name, x in sums.items()}
-        kind = gradient_types(real_of(self.like), self.fixed_point).Sums
-        return struct(kind, **sums, slots=self.tiles.entries if self.exact else None, bad=self.bad)
+        return {**sums, "slots": self.tiles.entries if self.exact else None, "bad": self.bad}
 
     def totals(self) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
         """Sums of the records' gradients (N, 4, 4) and, where asked for, of errors (N,) and channels' (N, 4, 4)."""
@@ -202,7 +199,7 @@ class _Collect(torch.autograd.Function):
         stops = torch.empty(shape, dtype=torch.int32, device=records.device)
         more = None if channels is None else records.new_empty(*shape, 4, 4)
         outputs = (plain, base, ids, depths, weights, alphas, stops, more)
-        scene.launch(collect_kernel(scene.real, max_hits, more is not None), [_hits(scene.real, outputs)])
+        scene.launch(collect_kernel(scene.real, max_hits, more is not None), [outputs])
         ctx.save_for_backward(*outputs)
         ctx.rest = (scene, request)
         ctx.mark_non_differentiable(ids, stops)
@@ -233,14 +230,7 @@ def _backward(
     assert depths is not None
     max_hits, with_errors, wide = depths.shape[-1], errors is not None, channels is not None
     sums = SlotSums(scene.records, scene.tiles, with_errors=with_errors, with_channels=wide)
-    images = {"plain": plain, "base": base, "depths": depths, "weights": weights, "alphas": alphas}
-    incoming = struct(gradient_types(scene.real).HitGradients, **images, errors=errors, channels=channels)
+    incoming = (plain, base, depths, weights, alphas, errors, channels)
     kernel = collect_backward_kernel(scene.real, max_hits, with_errors, sums.fixed_point, scene.tiles.exact, wide)
-    scene.launch(kernel, [_hits(scene.real, outputs), incoming, sums.argument()])
+    scene.launch(kernel, [outputs, incoming, sums.argument()])
     return sums.totals()
-
-
-def _hits(real: type, outputs: tuple[torch.Tensor | None, ...]) -> Argument:
-    """The struct `Hits` of the kernels; outputs have the order of its fields."""
-    kind = types(real).Hits
-    return struct(kind, **dict(zip(kind.vars, outputs, strict=True)))

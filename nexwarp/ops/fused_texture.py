@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import warp as wp
 
 from nexwarp.kernels.fused_scatter import SCATTER_THREADS, fused_scatter_kernel
 from nexwarp.kernels.fused_texture import (
@@ -15,7 +14,6 @@ from nexwarp.kernels.fused_texture import (
     BACKWARD_THREADS,
     FORWARD_BLOCKS,
     FORWARD_THREADS,
-    Fused,
     fused_kernels,
     half_scale,
     order_gradients,
@@ -31,7 +29,7 @@ from nexwarp.native.fused_texture import (
     logical_feature,
     logical_output,
 )
-from nexwarp.ops._interop import Argument, Context, array, first_derivative, graph_is_kept, launch, struct
+from nexwarp.ops._interop import Argument, Context, first_derivative, graph_is_kept, launch
 from nexwarp.ops.neural_field import HALF_GRADIENT, Field, Points, Rays
 
 GROUP_BYTES = 2**24  # of sums that a launch of the backward lookup adds to: a third of an H100's L2 cache
@@ -109,13 +107,7 @@ class _Colors(torch.autograd.Function):
         scale, unscale = _scales(grad)
         grad_encoded = torch.empty_like(encoded) if graph_is_kept() else encoded  # else gradients overwrite features
         fused, units = _fused(points, field, replace(ctx.rays, directions=directions), kept)
-        for name, tensor, dtype in (
-            ("scale", scale, wp.float32),
-            ("unscale", unscale, wp.float32),
-            ("grad_colors", grad, wp.vec3),
-            ("grad_encoded", grad_encoded, wp.int32),
-        ):
-            fused[name] = array(tensor, dtype)
+        fused |= {"scale": scale, "unscale": unscale, "grad_colors": grad, "grad_encoded": grad_encoded}
         grad_matrices = _mlp_backward(fused, weights, table, unscale)
         grad_grid, grad_points = _scatter(fused, points, table, units, need_positions or need_depths)
         return (
@@ -133,25 +125,11 @@ def _fused(points: Points, field: Field, rays: Rays, kept: Kept) -> tuple[dict[s
     hits, shift = len(points) // max(len(rays.directions), 1), 3 if height > 1 else 4
     units = -(-width // (1 << shift)) * -(-height // (16 >> shift)) * hits
     table = field.stored()
-    fields = {
-        "width": width,
-        "height": height,
-        "hits": hits,
-        "shift": shift,
-        "positions": array(points.positions, wp.vec3),
-        "depths": array(points.depths, wp.float32),
-        "directions": array(rays.directions, wp.vec3),
-        "table": array(table.view(-1), wp.float16),
-        "mask": table.shape[1] - 1,
-        "resolutions": array(field.resolutions, wp.float32),
-        "focal": array(points.focal, wp.float32),
-        "packed": array(kept.packed, wp.int32),
-        "offset": rays.offset,
-        "clamp": int(rays.clamp),
-        "encoded": array(kept.encoded, wp.int32),
-        "colors": array(kept.colors, wp.vec3),
-    }
-    return fields, units
+    image = {"width": width, "height": height, "hits": hits, "shift": shift}
+    seen = {"positions": points.positions, "depths": points.depths, "directions": rays.directions}
+    texture = {"table": table, "mask": table.shape[1] - 1, "resolutions": field.resolutions, "focal": points.focal}
+    results = {"offset": rays.offset, "clamp": int(rays.clamp), "encoded": kept.encoded, "colors": kept.colors}
+    return {**image, **seen, **texture, "packed": kept.packed, **results}, units
 
 
 def forward(points: Points, field: Field, rays: Rays, keep: bool) -> tuple[torch.Tensor, Kept]:
@@ -161,10 +139,10 @@ def forward(points: Points, field: Field, rays: Rays, keep: bool) -> tuple[torch
     fused, units = _fused(points, field, rays, kept)
     if keep:
         kept = kept._replace(encoded=packed.new_empty(units * 256))
-        fused["encoded"] = array(kept.encoded, wp.int32)
+        fused["encoded"] = kept.encoded
     threads = FORWARD_THREADS * FORWARD_BLOCKS * _multiprocessors(result)
     kernel = fused_kernels(field.grid.shape[2]).forward
-    launch(result, kernel, threads, [threads, struct(Fused, **fused)], [], block_dim=FORWARD_THREADS)
+    launch(result, kernel, threads, [threads, fused], [], block_dim=FORWARD_THREADS)
     return result, kept if rays.clamp else kept._replace(colors=result.new_empty(0, 3))
 
 
@@ -174,14 +152,13 @@ def _mlp_backward(
     """Write the gradients of the features, scaled, and return those of the matrices."""
     features, blocks = table.shape[2], BACKWARD_BLOCKS * _multiprocessors(table)
     slots = unscale.new_empty(blocks, sum(GRADIENTS))
-    arguments = struct(Fused, **fused, grad_matrices=array(slots.view(-1), wp.float32))
+    arguments = {**fused, "grad_matrices": slots}
     threads = BACKWARD_THREADS * blocks
     kernel = fused_kernels(features).backward
     launch(table, kernel, threads, [threads, arguments, fused["colors"]], [], block_dim=BACKWARD_THREADS)
     order = _order(features, len(weights[-1]), table.device)
     flat = unscale.new_empty(len(order))
-    inputs = [array(slots.sum(0), wp.float32), array(order, wp.int32), array(unscale, wp.float32)]
-    launch(table, order_gradients, len(order), inputs, [array(flat, wp.float32)])
+    launch(table, order_gradients, len(order), [slots.sum(0), order, unscale], [flat])
     parts = flat.split([matrix.numel() for matrix in weights])
     return [part.view_as(matrix) for part, matrix in zip(parts, weights, strict=True)]
 
@@ -193,10 +170,10 @@ def _scatter(
     levels, size, features = table.shape
     grad_grid = torch.zeros_like(table, dtype=torch.float32)
     grad_points = points.positions.new_empty(len(points) * need_points, 4)
-    outputs = {"grad_table": array(grad_grid.view(-1), wp.float32), "grad_points": array(grad_points, wp.vec4)}
+    outputs = {"grad_table": grad_grid, "grad_points": grad_points}
     kernel = fused_scatter_kernel(features)
     for first, end in level_groups(levels, size * features * 4):
-        arguments = struct(Fused, **fused, **outputs, first_level=first, end_level=end)
+        arguments = {**fused, **outputs, "first_level": first, "end_level": end}
         launch(table, kernel, units * 32, [arguments], [], block_dim=SCATTER_THREADS)
     return grad_grid, grad_points
 
@@ -222,9 +199,7 @@ def _pack(weights: Sequence[torch.Tensor], features: int) -> torch.Tensor:
     """Return the matrices as words of two halves, in the order in which the kernels' lanes load them."""
     sources = _sources(features, len(weights[-1]), weights[0].device)
     packed = torch.empty(len(sources), dtype=torch.float16, device=sources.device)
-    matrices = [array(matrix.reshape(-1), wp.float32) for matrix in weights]
-    inputs = [*matrices, array(sources, wp.int32)]
-    launch(packed, pack_matrices, len(packed), inputs, [array(packed, wp.float16)])
+    launch(packed, pack_matrices, len(packed), [*weights, sources], [packed])
     return packed.view(torch.int32)
 
 
@@ -232,8 +207,7 @@ def _scales(grad: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the factor (1,) that gradients in half precision are multiplied by, and its inverse."""
     largest = torch.linalg.vector_norm(grad, float("inf")).view(1)
     scale, unscale = torch.empty_like(largest), torch.empty_like(largest)
-    outputs = [array(x, wp.float32) for x in (scale, unscale)]
-    launch(grad, half_scale, 1, [array(largest, wp.float32), HALF_GRADIENT], outputs)
+    launch(grad, half_scale, 1, [largest, HALF_GRADIENT], [scale, unscale])
     return scale, unscale
 
 

@@ -6,8 +6,7 @@ import torch
 
 from nexwarp.kernels import surface as kernels
 from nexwarp.kernels.surface_backward import surface_backward_kernel
-from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Context, first_derivative, struct
+from nexwarp.ops._interop import Context, contiguous, first_derivative
 from nexwarp.ops.collect import Hits, SlotSums, Walked
 from nexwarp.ops.project import Pinhole, Projection
 from nexwarp.ops.tiles import Tiles
@@ -64,9 +63,7 @@ class _Surface(torch.autograd.Function):
             picks = torch.empty(*shape, 2, dtype=torch.int32, device=records.device)
             ctx.save_for_backward(stops, expected, normals, totals, picks)
             ctx.rest = scene
-        written = {"expected": expected, "median": median, "top": top, "normals": normals}
-        outputs = struct(types(scene.real).Surface, **written, totals=totals, picks=picks)
-        scene.launch(kernels.surface(scene.real), [stops, outputs])
+        scene.launch(kernels.surface, [stops, (expected, median, top, normals, totals, picks)])
         return expected, median, top, normals
 
     @staticmethod
@@ -74,10 +71,8 @@ class _Surface(torch.autograd.Function):
     def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         stops, expected, normals, totals, picks = ctx.saved_tensors
         scene: Walked = ctx.rest
-        sums, kind = SlotSums(scene.records, scene.tiles), types(scene.real).Surface
-        outputs = struct(kind, expected=expected, normals=normals, totals=totals, picks=picks)
-        expected, median, top, normals = (x.contiguous() for x in grads)
-        incoming = struct(kind, expected=expected, median=median, top=top, normals=normals)
+        sums = SlotSums(scene.records, scene.tiles)
+        outputs = (expected, None, None, normals, totals, picks)
         kernel = surface_backward_kernel(scene.real, sums.fixed_point, scene.tiles.exact)
-        scene.launch(kernel, [stops, outputs, incoming, sums.argument()])
+        scene.launch(kernel, [stops, outputs, contiguous(*grads), sums.argument()])
         return sums.totals()[0], None, None
