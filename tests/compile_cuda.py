@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 import nexwarp.kernels
-from nexwarp.kernels.types import MAX_HITS, types
+from nexwarp.kernels.types import MAX_HITS, PerReal, types
 
 # What the factories in nexwarp.kernels are called with, by the name of their parameters: each of their branches.
 VALUES: dict[str, tuple[Any, ...]] = {
@@ -68,8 +68,9 @@ def kernels(choice: str) -> Iterator[wp.Kernel]:
                 continue
             if isinstance(member, wp.Kernel):
                 yield member
-            elif hasattr(member, "is_kernel"):
-                yield member(wp.float32)
+            elif isinstance(member, PerReal) and member.names is not None:
+                for chosen in itertools.product(*(values[name] for name in member.names)):
+                    yield member(wp.float32, **dict(zip(member.names, chosen, strict=True)))
             elif name.endswith(("_kernel", "_kernels")):
                 yield from made_by(member, values)
 

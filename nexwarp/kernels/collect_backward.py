@@ -26,257 +26,167 @@ n . d and the like (see `hit_gradients`); the record's follow by products with t
 lists, which hits count, which are in the buffer, where the walk ends.
 """
 
-import functools
-from types import SimpleNamespace
+from __future__ import annotations
+
+from typing import Any
 
 import warp as wp
 
-from nexwarp.kernels.collect import channel_functions, hit_buffer
+from nexwarp.kernels.collect import channel_product, load_channels
 from nexwarp.kernels.shape import alpha_at, far_outside
 from nexwarp.kernels.surfel import hit, hit_gradients, record_gradients
-from nexwarp.kernels.types import TileLists, ints, types
+from nexwarp.kernels.types import FixedSums, TileLists, func_per_real, ints, per_real
 from nexwarp.kernels.walk import block_of, overflowed, pixel_of, stage, tile_of, walk
 from nexwarp.native.fixed_point import fixed_point_add, fixed_point_record_sum
 from nexwarp.native.staging import BLOCK_DIM, staged_name, staged_record
 from nexwarp.native.warp import any_in_warp, lane_index, warp_max, warp_record_sum, warp_size, warp_sum
 
 
-@functools.cache
-def gradient_types(real: type, fixed_point: bool = False) -> SimpleNamespace:
-    """Make the structs of what the backward pass reads and adds to.
-
-    With `fixed_point` sums are pairs of integers, see `native.fixed_point`, so that they do not depend on any order.
-    """
-    t = types(real)
-    pairs = wp.array2d(dtype=wp.int64)
-
-    @wp.struct
-    class HitGradients:
-        """Gradients of the outputs of `collect`, and the error of each pixel."""
-
-        plain: t.vec3s
-        base: t.vec3s
-        depths: t.real_rows
-        weights: t.real_rows
-        alphas: t.reals
-        errors: t.reals
-        channels: t.vec4_rows
-
-    @wp.struct
-    class Sums:
-        """What is added up for each surfel or gradient slot, and the flag of a term that fixed point cannot hold."""
-
-        slots: ints
-        records: pairs if fixed_point else t.vec4_rows
-        errors: pairs if fixed_point else t.reals
-        bad: ints
-        channels: pairs if fixed_point else t.vec4_rows
-
-    return SimpleNamespace(HitGradients=HitGradients, Sums=Sums)
+@func_per_real
+def add(sums: Any, i: int, k: int, a: vec4, b: vec4, n: vec4, c: vec4):
+    """Add the sum over a warp of records' gradients to the slot of place k, or of surfel i; return the slot."""
+    slot = int(i)
+    if wp.static(by_place):
+        slot = sums.slots[k]
+    if wp.static(fixed_point):
+        fixed_point_record_sum(sums.records, slot, a, b, n, c, sums.bad)
+    else:
+        warp_record_sum(sums.records, slot, a, b, n, c)
+    return slot
 
 
-@functools.cache
-def add_function(real: type, fixed_point: bool, by_place: bool) -> wp.Function:
-    """Make the function that adds the sum over a warp of records' gradients to the slot of place k, or of surfel i."""
-    t = types(real)
-    vec4, Sums = t.vec4, gradient_types(real, fixed_point).Sums
-
-    @wp.func
-    def add(sums: Sums, i: int, k: int, a: vec4, b: vec4, n: vec4, c: vec4):
-        slot = int(i)
-        if wp.static(by_place):
-            slot = sums.slots[k]
+@func_per_real
+def add_channels(sums: Any, slot: int, grad: mat44):
+    """Add the sum over a warp of channels' gradients to a slot, in a wide walk."""
+    if wp.static(wide):
         if wp.static(fixed_point):
-            fixed_point_record_sum(sums.records, slot, a, b, n, c, sums.bad)
+            fixed_point_record_sum(sums.channels, slot, grad[0], grad[1], grad[2], grad[3], sums.bad)
         else:
-            warp_record_sum(sums.records, slot, a, b, n, c)
-        return slot
-
-    return add
+            warp_record_sum(sums.channels, slot, grad[0], grad[1], grad[2], grad[3])
 
 
-@functools.cache
-def add_channels_function(real: type, fixed_point: bool, wide: bool) -> wp.Function:
-    """Make the function that adds the sum over a warp of channels' gradients to a slot, in a wide walk."""
-    Sums = gradient_types(real, fixed_point).Sums
-
-    @wp.func
-    def add_channels(sums: Sums, slot: int, grad: types(real).mat44):
-        if wp.static(wide):
+@func_per_real
+def add_error(sums: Any, slot: int, error: real):
+    """Add the sum of errors over a warp to a slot, where they are asked for."""
+    if wp.static(with_errors):
+        total = warp_sum(error)
+        if lane_index() == 0:
             if wp.static(fixed_point):
-                fixed_point_record_sum(sums.channels, slot, grad[0], grad[1], grad[2], grad[3], sums.bad)
+                fixed_point_add(sums.errors, slot, total, sums.bad)
             else:
-                warp_record_sum(sums.channels, slot, grad[0], grad[1], grad[2], grad[3])
-
-    return add_channels
+                wp.atomic_add(sums.errors, slot, total)
 
 
-@functools.cache
-def add_error_function(real: type, fixed_point: bool, with_errors: bool) -> wp.Function:
-    """Make the function that adds the sum of errors over a warp to a slot, where they are asked for."""
-    Sums = gradient_types(real, fixed_point).Sums
-
-    @wp.func
-    def add_error(sums: Sums, slot: int, error: real):
-        if wp.static(with_errors):
-            total = warp_sum(error)
-            if lane_index() == 0:
-                if wp.static(fixed_point):
-                    fixed_point_add(sums.errors, slot, total, sums.bad)
-                else:
-                    wp.atomic_add(sums.errors, slot, total)
-
-    return add_error
+@func_per_real
+def buffered_gradients(i: int, ids: Any, grad_weights: Any, grad_depths: Any):
+    """Gradients of a hit's weight and depth, and whether the buffer holds it."""
+    grad_weight = real(0.0)
+    grad_depth = real(0.0)
+    buffered = bool(False)
+    for j in range(wp.static(max_hits)):
+        if i == ids[j]:
+            grad_weight = grad_weights[j]
+            grad_depth = grad_depths[j]
+            buffered = True
+    return grad_weight, grad_depth, buffered
 
 
-@functools.cache
-def buffered_gradients_function(real: type, max_hits: int) -> wp.Function:
-    """Make the function that returns the gradients of a hit's weight and depth, and whether the buffer holds it."""
-    buffer = hit_buffer(real, max_hits)
-    reals, integers = buffer.reals, buffer.integers
+@per_real("dtype")
+def reduce_slots(
+    first: int, order: ints, ends: ints, slots: wp.array2d(dtype=dtype), columns: int, sums: wp.array2d(dtype=dtype)
+):
+    """The second half of a backward pass on a CPU: the sums of each surfel's gradient slots. A thread is a surfel.
 
-    @wp.func
-    def buffered_gradients(i: int, ids: integers, grad_weights: reals, grad_depths: reals):
-        grad_weight = real(0.0)
-        grad_depth = real(0.0)
-        buffered = bool(False)
-        for j in range(wp.static(max_hits)):
-            if i == ids[j]:
-                grad_weight = grad_weights[j]
-                grad_depth = grad_depths[j]
-                buffered = True
-        return grad_weight, grad_depth, buffered
-
-    return buffered_gradients
-
-
-@functools.cache
-def reduce_slots_kernel(dtype: type) -> wp.Kernel:
-    """Make the kernel of the second half of a backward pass on a CPU: the sums of each surfel's gradient slots.
-
-    A thread is a surfel. `slots` (M, columns) are in the order of emission, in which the entries of the surfel
-    order[rank] lie together and end at ends[rank]. They are added to `sums` (N, columns) in a fixed order.
+    `slots` (M, columns) are in the order of emission, in which the entries of the surfel order[rank] lie together and
+    end at ends[rank]. They are added to `sums` (N, columns) in a fixed order.
     """
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def reduce_slots(
-        first: int, order: ints, ends: ints, slots: wp.array2d(dtype=dtype), columns: int, sums: wp.array2d(dtype=dtype)
-    ):
-        rank = first + wp.tid()
-        start = int(0)
-        if rank > 0:
-            start = ends[rank - 1]
-        for c in range(columns):
-            for e in range(start, ends[rank]):
-                sums[order[rank], c] += slots[e, c]
-
-    return reduce_slots
+    rank = first + wp.tid()
+    start = int(0)
+    if rank > 0:
+        start = ends[rank - 1]
+    for c in range(columns):
+        for e in range(start, ends[rank]):
+            sums[order[rank], c] += slots[e, c]
 
 
-@functools.cache
-def collect_backward_kernel(
-    real: type,
-    max_hits: int,
-    with_errors: bool = False,
-    fixed_point: bool = False,
-    by_place: bool = False,
-    wide: bool = False,
-) -> wp.Kernel:
-    """Make the backward kernel; a wide one differentiates sixteen more channels.
+NAMES = ("max_hits", "with_errors", "fixed_point", "by_place", "wide")
 
-    With `by_place` each place of the walk has a slot of its own, `slots[k]`, instead of one a surfel.
-    """
-    t = types(real)
-    vec4 = t.vec4
-    g = gradient_types(real, fixed_point)
-    buffer, buffered_gradients = hit_buffer(real, max_hits), buffered_gradients_function(real, max_hits)
-    add, add_error = add_function(real, fixed_point, by_place), add_error_function(real, fixed_point, with_errors)
-    channels, add_channels = channel_functions(real, wide), add_channels_function(real, fixed_point, wide)
-    ALPHA_MIN, ONE, ZERO = t.ALPHA_MIN, t.ONE, t.ZERO
 
-    @wp.kernel(
-        enable_backward=False,
-        grid_stride=False,
-        module="unique",
-        module_options={"fast_math": real is wp.float32},
-        launch_bounds=BLOCK_DIM,
-    )
-    def collect_backward(
-        first: int,
-        surfels: t.Surfels,
-        lists: TileLists,
-        view: t.View,
-        hits: t.Hits,
-        grads: g.HitGradients,
-        sums: g.Sums,
-    ):
-        thread = first + wp.tid()
-        xy, inside, d = pixel_of(thread, view)
-        middle, half = block_of(xy, view)
-        # Threads outside the image walk along without a hit: all lanes of a warp must reach the sums together.
-        p = wp.min(xy[1], view.size[1] - 1) * view.size[0] + wp.min(xy[0], view.size[0] - 1)
-        stop = hits.stops[p]
-        if not inside:
-            stop = int(0)
-        grad_plain = grads.plain[p]
-        grad_base = grads.base[p]
-        grad_total = grads.alphas[p]
-        rest = wp.dot(grad_plain, hits.plain[p]) + wp.dot(grad_base, hits.base[p]) + grad_total * hits.alphas[p]
-        grad_channels = channels.load(grads.channels, p)
-        rest += channels.product(hits.channels, p, grad_channels)
-        ids = buffer.integers()
-        grad_weights = buffer.reals()
-        grad_depths = buffer.reals()
-        for j in range(wp.static(max_hits)):
-            ids[j] = hits.ids[p, j]
-            grad_weights[j] = grads.weights[p, j]
-            grad_depths[j] = grads.depths[p, j]
-            rest += grad_weights[j] * hits.weights[p, j]
-        error = real(0.0)
-        if wp.static(with_errors):
-            error = grads.errors[p]
-        transmittance = real(1.0)
-        overflow = overflowed(lists)
-        bounds = walk(tile_of(thread), lists, overflow)
-        width = warp_size()
-        lane = lane_index()
-        last = wp.min(warp_max(stop), bounds[1])
-        for batch in range(bounds[0], last, width):
-            staged = stage(batch + lane, last, surfels, lists, overflow, middle, half)
-            for slot in range(staged[0]):
-                name = staged_name(slot, staged[1], batch)
-                i = name[0]
-                k = name[1]
-                a, b, n, c = staged_record(slot, surfels.records, i)
-                u, v, depth = hit(a, b, n, c[3], d)
-                # A CPU skips at once what certainly does not count. Behind that, alpha is computed straight on, so that
-                # the compiler uses its exponentials again for the derivative.
-                if width == 1 and (k >= stop or far_outside(u, v, surfels.limits[i])):
-                    continue
-                alpha = alpha_at(u, v, a[3], b[3], n[3])
-                if not (k < stop and alpha >= ALPHA_MIN and depth > view.near):
-                    alpha = ZERO
-                if any_in_warp(wp.where(alpha > ZERO, 1, 0)) != 0:
-                    grad = t.vec7()
-                    weight = alpha * transmittance
-                    plain_weight = weight
-                    grad_color = grad_plain
-                    if alpha > ZERO:
-                        grad_weight, grad_depth, buffered = buffered_gradients(i, ids, grad_weights, grad_depths)
-                        if buffered:
-                            grad_color = grad_base
-                            plain_weight = ZERO
-                        q = grad_total + grad_weight
-                        q += grad_color[0] * c[0] + grad_color[1] * c[1] + grad_color[2] * c[2]
-                        q += wp.where(buffered, ZERO, channels.product(surfels.channels, i, grad_channels))
-                        rest -= q * weight
-                        grad_alpha = transmittance * q - rest / (ONE - alpha)
-                        grad = hit_gradients(a, b, n, c[3], d, grad_alpha, grad_depth)
-                    transmittance = transmittance * (ONE - alpha)
-                    row_a, row_b, row_n = record_gradients(grad, d)
-                    row_c = vec4(grad_color[0] * weight, grad_color[1] * weight, grad_color[2] * weight, grad[3])
-                    target = add(sums, i, k, row_a, row_b, row_n, row_c)
-                    add_error(sums, target, weight * error)
-                    add_channels(sums, target, grad_channels * plain_weight)
-
-    return collect_backward
+@per_real(*NAMES, grid_stride=False, fast_math=True, launch_bounds=BLOCK_DIM)
+def collect_backward(
+    first: int,
+    surfels: Surfels,
+    lists: TileLists,
+    view: View,
+    hits: Hits,
+    grads: HitGradients,
+    sums: FixedSums if fixed_point else Sums,
+):
+    thread = first + wp.tid()
+    xy, inside, d = pixel_of(thread, view)
+    middle, half = block_of(xy, view)
+    # Threads outside the image walk along without a hit: all lanes of a warp must reach the sums together.
+    p = wp.min(xy[1], view.size[1] - 1) * view.size[0] + wp.min(xy[0], view.size[0] - 1)
+    stop = hits.stops[p]
+    if not inside:
+        stop = int(0)
+    grad_plain = grads.plain[p]
+    grad_base = grads.base[p]
+    grad_total = grads.alphas[p]
+    rest = wp.dot(grad_plain, hits.plain[p]) + wp.dot(grad_base, hits.base[p]) + grad_total * hits.alphas[p]
+    grad_channels = load_channels(grads.channels, p)
+    rest += channel_product(hits.channels, p, grad_channels)
+    ids = wp.vector(length=wp.static(max(max_hits, 1)), dtype=wp.int32)
+    grad_weights = wp.vector(length=wp.static(max(max_hits, 1)), dtype=real)
+    grad_depths = wp.vector(length=wp.static(max(max_hits, 1)), dtype=real)
+    for j in range(wp.static(max_hits)):
+        ids[j] = hits.ids[p, j]
+        grad_weights[j] = grads.weights[p, j]
+        grad_depths[j] = grads.depths[p, j]
+        rest += grad_weights[j] * hits.weights[p, j]
+    error = real(0.0)
+    if wp.static(with_errors):
+        error = grads.errors[p]
+    transmittance = real(1.0)
+    overflow = overflowed(lists)
+    bounds = walk(tile_of(thread), lists, overflow)
+    width = warp_size()
+    lane = lane_index()
+    last = wp.min(warp_max(stop), bounds[1])
+    for batch in range(bounds[0], last, width):
+        staged = stage(batch + lane, last, surfels, lists, overflow, middle, half)
+        for slot in range(staged[0]):
+            name = staged_name(slot, staged[1], batch)
+            i = name[0]
+            k = name[1]
+            a, b, n, c = staged_record(slot, surfels.records, i)
+            u, v, depth = hit(a, b, n, c[3], d)
+            # A CPU skips at once what certainly does not count. Behind that, alpha is computed straight on, so that
+            # the compiler uses its exponentials again for the derivative.
+            if width == 1 and (k >= stop or far_outside(u, v, surfels.limits[i])):
+                continue
+            alpha = alpha_at(u, v, a[3], b[3], n[3])
+            if not (k < stop and alpha >= ALPHA_MIN and depth > view.near):
+                alpha = ZERO
+            if any_in_warp(wp.where(alpha > ZERO, 1, 0)) != 0:
+                grad = vec7()
+                weight = alpha * transmittance
+                plain_weight = weight
+                grad_color = grad_plain
+                if alpha > ZERO:
+                    grad_weight, grad_depth, buffered = buffered_gradients(i, ids, grad_weights, grad_depths)
+                    if buffered:
+                        grad_color = grad_base
+                        plain_weight = ZERO
+                    q = grad_total + grad_weight
+                    q += grad_color[0] * c[0] + grad_color[1] * c[1] + grad_color[2] * c[2]
+                    q += wp.where(buffered, ZERO, channel_product(surfels.channels, i, grad_channels))
+                    rest -= q * weight
+                    grad_alpha = transmittance * q - rest / (ONE - alpha)
+                    grad = hit_gradients(a, b, n, c[3], d, grad_alpha, grad_depth)
+                transmittance = transmittance * (ONE - alpha)
+                row_a, row_b, row_n = record_gradients(grad, d)
+                row_c = vec4(grad_color[0] * weight, grad_color[1] * weight, grad_color[2] * weight, grad[3])
+                target = add(sums, i, k, row_a, row_b, row_n, row_c)
+                add_error(sums, target, weight * error)
+                add_channels(sums, target, grad_channels * plain_weight)

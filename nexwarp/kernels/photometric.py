@@ -102,7 +102,8 @@ def photometric(first: int, given: Compared, scales: vec3, saturation: real, pix
             terms[0] = distance(difference(clamped_color(given.image[p]), given.target[p], saturation)) * scales[0]
         if scales[1] != ZERO:
             terms[1] = (
-                distance(difference(given.textured[p] / (weight + real(EPS)), given.target[p], saturation)) * scales[1]
+                distance(difference(given.textured[p] / (weight + WEIGHT_EPSILON), given.target[p], saturation))
+                * scales[1]
             )
         terms[2] = (ONE - weight) * scales[2]
     write_sum(sums, 0, p, terms[0])
@@ -128,7 +129,7 @@ def photometric_backward(
         grads.image[p] = clamped_color_backward(color, grad)
     change = real(0.0)
     if grad_texture:
-        divisor = total(given.weights, p) + real(EPS)
+        divisor = total(given.weights, p) + WEIGHT_EPSILON
         seen = given.textured[p] / divisor
         pull = signs(difference(seen, given.target[p], saturation)) * (grad_texture[0] * scales[1]) / divisor
         change -= wp.dot(pull, seen)
@@ -271,7 +272,7 @@ def depth_errors_backward(  # noqa: PLR0913  # a kernel entry point
             break
         if expected[i] > ZERO:
             change += sign(mean / expected[i] - ONE) / expected[i]
-    change *= grad_loss[0] * factor / wp.max(totals[1], ONE) / (total(weights, p) + real(EPS))
+    change *= grad_loss[0] * factor / wp.max(totals[1], ONE) / (total(weights, p) + WEIGHT_EPSILON)
     for h in range(depths.shape[1]):
         grad_depths[p, h] = change * weights[p, h]
         grad_weights[p, h] = change * (depths[p, h] - mean)

@@ -5,18 +5,19 @@ gradients of coefficients and directions, which `wp.grad` of the basis gives. No
 clamped to 0 has no gradient. Constants and signs are the field's.
 """
 
-import functools
-from types import SimpleNamespace
+from __future__ import annotations
+
 from typing import Any
 
 import warp as wp
 
-from nexwarp.kernels.types import types
+from nexwarp.kernels.types import func_per_real, per_real
 
 BAND_0 = 0.28209479177387814
 BAND_1 = 0.4886025119029199
 BAND_2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 BAND_3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+A0, B0, (C0, C1, C2), (D0, D1, D2, D3, D4) = BAND_0, BAND_1, BAND_2, BAND_3
 TINY = wp.constant(wp.float64(1e-12))
 
 
@@ -40,183 +41,157 @@ def unclamped(grad: Any, color: Any):
     return out
 
 
-@functools.cache
-def basis_function(real: type, degree: int) -> wp.Function:
-    """Make the function that evaluates the (degree + 1)^2 basis functions at a unit direction."""
-    vec3 = types(real).vec3
-    vec = wp.types.vector(length=(degree + 1) ** 2, dtype=real)
-    A0, B0 = wp.constant(real(BAND_0)), wp.constant(real(BAND_1))
-    C0, C1, C2 = (wp.constant(real(c)) for c in BAND_2)
-    D0, D1, D2, D3, D4 = (wp.constant(real(c)) for c in BAND_3)
-
-    @wp.func
-    def basis(d: vec3):
-        out = vec()
-        out[0] = A0
-        if wp.static(degree >= 1):
-            out[1] = -B0 * d[1]
-            out[2] = B0 * d[2]
-            out[3] = -B0 * d[0]
-        if wp.static(degree >= 2):
-            xx = d[0] * d[0]
-            yy = d[1] * d[1]
-            zz = d[2] * d[2]
-            out[4] = C0 * d[0] * d[1]
-            out[5] = -C0 * d[1] * d[2]
-            out[6] = C1 * (real(2.0) * zz - xx - yy)
-            out[7] = -C0 * d[0] * d[2]
-            out[8] = C2 * (xx - yy)
-        if wp.static(degree >= 3):
-            x2 = d[0] * d[0]
-            y2 = d[1] * d[1]
-            z2 = d[2] * d[2]
-            out[9] = -D0 * d[1] * (real(3.0) * x2 - y2)
-            out[10] = D1 * d[0] * d[1] * d[2]
-            out[11] = -D2 * d[1] * (real(4.0) * z2 - x2 - y2)
-            out[12] = D3 * d[2] * (real(2.0) * z2 - real(3.0) * x2 - real(3.0) * y2)
-            out[13] = -D2 * d[0] * (real(4.0) * z2 - x2 - y2)
-            out[14] = D4 * d[2] * (x2 - y2)
-            out[15] = -D0 * d[0] * (x2 - real(3.0) * y2)
-        return out
-
-    return basis
+@func_per_real
+def basis(d: vec3):
+    """The (degree + 1)^2 basis functions at a unit direction."""
+    out = wp.vector(length=wp.static((degree + 1) ** 2), dtype=real)
+    out[0] = A0
+    if wp.static(degree >= 1):
+        out[1] = -B0 * d[1]
+        out[2] = B0 * d[2]
+        out[3] = -B0 * d[0]
+    if wp.static(degree >= 2):
+        xx = d[0] * d[0]
+        yy = d[1] * d[1]
+        zz = d[2] * d[2]
+        out[4] = C0 * d[0] * d[1]
+        out[5] = -C0 * d[1] * d[2]
+        out[6] = C1 * (real(2.0) * zz - xx - yy)
+        out[7] = -C0 * d[0] * d[2]
+        out[8] = C2 * (xx - yy)
+    if wp.static(degree >= 3):
+        x2 = d[0] * d[0]
+        y2 = d[1] * d[1]
+        z2 = d[2] * d[2]
+        out[9] = -D0 * d[1] * (real(3.0) * x2 - y2)
+        out[10] = D1 * d[0] * d[1] * d[2]
+        out[11] = -D2 * d[1] * (real(4.0) * z2 - x2 - y2)
+        out[12] = D3 * d[2] * (real(2.0) * z2 - real(3.0) * x2 - real(3.0) * y2)
+        out[13] = -D2 * d[0] * (real(4.0) * z2 - x2 - y2)
+        out[14] = D4 * d[2] * (x2 - y2)
+        out[15] = -D0 * d[0] * (x2 - real(3.0) * y2)
+    return out
 
 
-@functools.cache
-def plain_colors_kernels(real: type, degree: int) -> SimpleNamespace:
-    """Make the kernels of max(0, 0.5 + SH(direction from the camera's centre to the surfel's)).
+@func_per_real
+def ray_dot(ray: vec3, w: Any):
+    return wp.dot(basis(direction_of(ray)), w)
 
-    `sh0` is (N, 1), `shN` (N, C - 1). Backward is one kernel for the coefficients and one, a thread a surfel, for the
-    ray from the camera's centre to the surfel's. In the former, `sharing` threads share a surfel: with C of them each
-    writes one coefficient and neighbours write neighbouring addresses; one alone evaluates the basis but once. Both
-    read the colours: where one is 0 it was clamped and has no gradient.
+
+@per_real("degree")
+def plain_colors(first: int, sh0: vec3_rows, shN: vec3_rows, means: vec3s, position: vec3s, colors: vec3s):
+    """max(0, 0.5 + SH(direction from the camera's centre to the surfel's))."""
+    i = first + wp.tid()
+    b = basis(direction_of(means[i] - position[0]))
+    color = vec3(real(0.5), real(0.5), real(0.5)) + sh0[i, 0] * b[0]
+    for k in range(1, wp.static((degree + 1) ** 2)):
+        color += shN[i, k - 1] * b[k]
+    colors[i] = wp.max(color, vec3())
+
+
+@per_real("degree")
+def plain_coefficients_backward(
+    first: int,
+    sharing: int,
+    means: vec3s,
+    position: vec3s,
+    colors: vec3s,
+    grad_colors: vec3s,
+    # outputs
+    grad_sh0: vec3_rows,
+    grad_shN: vec3_rows,
+):
+    """Gradients of coefficients, sh0 (N, 1) and shN (N, C - 1); a colour of 0 was clamped and has none.
+
+    `sharing` threads share a surfel: with C of them each writes one coefficient and neighbours write neighbouring
+    addresses; one alone evaluates the basis but once.
     """
-    t, basis = types(real), basis_function(real, degree)
-    vec3, vec3s, vec3_rows = t.vec3, t.vec3s, t.vec3_rows
-    count = (degree + 1) ** 2
-    vec = wp.types.vector(length=count, dtype=real)
-
-    @wp.func
-    def basis_dot(ray: vec3, w: vec):
-        return wp.dot(basis(direction_of(ray)), w)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def plain_colors(first: int, sh0: vec3_rows, shN: vec3_rows, means: vec3s, position: vec3s, colors: vec3s):
-        i = first + wp.tid()
-        b = basis(direction_of(means[i] - position[0]))
-        color = vec3(real(0.5), real(0.5), real(0.5)) + sh0[i, 0] * b[0]
-        for k in range(1, wp.static(count)):
-            color += shN[i, k - 1] * b[k]
-        colors[i] = wp.max(color, vec3())
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def plain_coefficients_backward(
-        first: int,
-        sharing: int,
-        means: vec3s,
-        position: vec3s,
-        colors: vec3s,
-        grad_colors: vec3s,
-        # outputs
-        grad_sh0: vec3_rows,
-        grad_shN: vec3_rows,
-    ):
-        thread = first + wp.tid()
-        i = thread // sharing
-        grad = unclamped(grad_colors[i], colors[i])
-        b = basis(direction_of(means[i] - position[0]))
-        for k in range(thread - i * sharing, grad_shN.shape[1] + 1, sharing):
-            # Not b[k]: an index that the compiler does not know moves the basis from registers to memory.
-            value = real(0.0)
-            for c in range(wp.static(count)):
-                value = wp.where(c == k, b[c], value)
-            if k == 0:
-                grad_sh0[i, 0] = grad * value
-            else:
-                grad_shN[i, k - 1] = grad * value
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def plain_rays_backward(
-        first: int, shN: vec3_rows, means: vec3s, position: vec3s, colors: vec3s, grad_colors: vec3s, grad_rays: vec3s
-    ):
-        i = first + wp.tid()
-        grad = unclamped(grad_colors[i], colors[i])
-        w = vec()
-        for k in range(1, wp.static(count)):
-            w[k] = wp.dot(grad, shN[i, k - 1])
-        ray, _w = wp.grad(basis_dot)(means[i] - position[0], w)
-        grad_rays[i] = ray
-
-    return SimpleNamespace(
-        forward=plain_colors, coefficients_backward=plain_coefficients_backward, rays_backward=plain_rays_backward
-    )
+    thread = first + wp.tid()
+    i = thread // sharing
+    grad = unclamped(grad_colors[i], colors[i])
+    b = basis(direction_of(means[i] - position[0]))
+    for k in range(thread - i * sharing, grad_shN.shape[1] + 1, sharing):
+        # Not b[k]: an index that the compiler does not know moves the basis from registers to memory.
+        value = real(0.0)
+        for c in range(wp.static((degree + 1) ** 2)):
+            value = wp.where(c == k, b[c], value)
+        if k == 0:
+            grad_sh0[i, 0] = grad * value
+        else:
+            grad_shN[i, k - 1] = grad * value
 
 
-@functools.cache
-def textured_colors_kernels(real: type, storage: type, degree: int, clamp: bool) -> SimpleNamespace:
-    """Make the kernels of offset + SH(ray direction); the field's coefficients are in rows coefficient * 3 + channel.
+@per_real("degree")
+def plain_rays_backward(
+    first: int, shN: vec3_rows, means: vec3s, position: vec3s, colors: vec3s, grad_colors: vec3s, grad_rays: vec3s
+):
+    """Gradients of the rays from the camera's centre to the surfels' centres."""
+    i = first + wp.tid()
+    grad = unclamped(grad_colors[i], colors[i])
+    w = wp.vector(length=wp.static((degree + 1) ** 2), dtype=real)
+    for k in range(1, wp.static((degree + 1) ** 2)):
+        w[k] = wp.dot(grad, shN[i, k - 1])
+    ray, _w = wp.grad(ray_dot)(means[i] - position[0], w)
+    grad_rays[i] = ray
 
-    The backward kernel stores grad_coefficients times `scale[0]`, so that half precision holds them.
-    """
-    t, basis = types(real), basis_function(real, degree)
-    vec3, reals, vec3s = t.vec3, t.reals, t.vec3s
-    count = (degree + 1) ** 2
-    vec = wp.types.vector(length=count, dtype=real)
 
-    @wp.func
-    def color_of(coefficients: wp.array2d(dtype=storage), i: int, b: vec, offset: real):
-        color = vec3(offset, offset, offset)
-        for k in range(wp.static(count)):
-            color[0] += real(coefficients[3 * k, i]) * b[k]
-            color[1] += real(coefficients[3 * k + 1, i]) * b[k]
-            color[2] += real(coefficients[3 * k + 2, i]) * b[k]
-        return color
+@func_per_real
+def color_of(coefficients: wp.array2d(dtype=storage), i: int, b: Any, offset: real):
+    color = vec3(offset, offset, offset)
+    for k in range(wp.static((degree + 1) ** 2)):
+        color[0] += real(coefficients[3 * k, i]) * b[k]
+        color[1] += real(coefficients[3 * k + 1, i]) * b[k]
+        color[2] += real(coefficients[3 * k + 2, i]) * b[k]
+    return color
 
-    @wp.func
-    def basis_dot(d: vec3, w: vec):
-        return wp.dot(basis(d), w)
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def textured_colors(
-        first: int, coefficients: wp.array2d(dtype=storage), directions: vec3s, hits: int, offset: real, colors: vec3s
-    ):
-        i = first + wp.tid()
-        color = color_of(coefficients, i, basis(directions[i // hits]), offset)
-        if wp.static(clamp):
-            color = wp.max(color, vec3())
-        colors[i] = color
+@func_per_real
+def direction_dot(d: vec3, w: Any):
+    return wp.dot(basis(d), w)
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def textured_colors_backward(  # noqa: PLR0913  # a kernel entry point
-        first: int,
-        coefficients: wp.array2d(dtype=storage),
-        directions: vec3s,
-        hits: int,
-        offset: real,
-        scale: reals,
-        grad_colors: vec3s,
-        # outputs
-        grad_coefficients: wp.array2d(dtype=storage),
-        grad_directions: vec3s,
-    ):
-        i = first + wp.tid()
-        direction = directions[i // hits]
-        b = basis(direction)
-        grad = grad_colors[i]
-        if wp.static(clamp):
-            grad = unclamped(grad, color_of(coefficients, i, b, offset))
-        for k in range(wp.static(count)):
-            for c in range(3):
-                grad_coefficients[3 * k + c, i] = storage(grad[c] * b[k] * scale[0])
-        if grad_directions.shape[0] > 0:
-            w = vec()
-            for k in range(wp.static(count)):
-                w[k] = (
-                    grad[0] * real(coefficients[3 * k, i])
-                    + grad[1] * real(coefficients[3 * k + 1, i])
-                    + grad[2] * real(coefficients[3 * k + 2, i])
-                )
-            gd, _w = wp.grad(basis_dot)(direction, w)
-            grad_directions[i] = gd
 
-    return SimpleNamespace(forward=textured_colors, backward=textured_colors_backward)
+@per_real("storage", "degree", "clamp")
+def textured_colors(
+    first: int, coefficients: wp.array2d(dtype=storage), directions: vec3s, hits: int, offset: real, colors: vec3s
+):
+    """Offset + SH(ray direction); coefficients are in rows coefficient * 3 + channel."""
+    i = first + wp.tid()
+    color = color_of(coefficients, i, basis(directions[i // hits]), offset)
+    if wp.static(clamp):
+        color = wp.max(color, vec3())
+    colors[i] = color
+
+
+@per_real("storage", "degree", "clamp")
+def textured_colors_backward(  # noqa: PLR0913  # a kernel entry point
+    first: int,
+    coefficients: wp.array2d(dtype=storage),
+    directions: vec3s,
+    hits: int,
+    offset: real,
+    scale: reals,
+    grad_colors: vec3s,
+    # outputs
+    grad_coefficients: wp.array2d(dtype=storage),
+    grad_directions: vec3s,
+):
+    """Gradients; those of coefficients times `scale[0]`, so that half precision holds them."""
+    i = first + wp.tid()
+    direction = directions[i // hits]
+    b = basis(direction)
+    grad = grad_colors[i]
+    if wp.static(clamp):
+        grad = unclamped(grad, color_of(coefficients, i, b, offset))
+    for k in range(wp.static((degree + 1) ** 2)):
+        for c in range(3):
+            grad_coefficients[3 * k + c, i] = storage(grad[c] * b[k] * scale[0])
+    if grad_directions.shape[0] > 0:
+        w = wp.vector(length=wp.static((degree + 1) ** 2), dtype=real)
+        for k in range(wp.static((degree + 1) ** 2)):
+            w[k] = (
+                grad[0] * real(coefficients[3 * k, i])
+                + grad[1] * real(coefficients[3 * k + 1, i])
+                + grad[2] * real(coefficients[3 * k + 2, i])
+            )
+        gd, _w = wp.grad(direction_dot)(direction, w)
+        grad_directions[i] = gd

@@ -23,8 +23,9 @@ from nexwarp.native.warp import tile_size
 
 # Pixels added around the polygon: rounding must never cull a hit.
 MARGIN = 0.01
-RELATIVE_MARGIN = wp.constant(wp.float64(1e-6))
-HUGE = wp.constant(wp.float64(1e30))
+RELATIVE_MARGIN = 1e-6
+LARGEST = 1e30
+HUGE = wp.constant(wp.float64(LARGEST))
 SHORT_OF_NEAR = wp.constant(wp.float64(0.999))
 # Of a quad that one plane clips.
 MAX_CORNERS = 5
@@ -128,17 +129,17 @@ def tile_polygon(
     if count == 0:
         return
     size = wp.max(wp.max(wp.abs(low[0]), wp.abs(low[1])), wp.max(wp.abs(high[0]), wp.abs(high[1])))
-    if not (size < real(HUGE)):
+    if not (size < LARGEST):
         # Too large for arithmetic, or not a number: list it everywhere, the walk decides.
         for k in range(4):
-            x = wp.where(k == 0 or k == 3, -real(HUGE), real(HUGE))
-            polygons.corners[i, k] = vec2(x, wp.where(k < 2, -real(HUGE), real(HUGE)))
+            x = wp.where(k == 0 or k == 3, -LARGEST, LARGEST)
+            polygons.corners[i, k] = vec2(x, wp.where(k < 2, -LARGEST, LARGEST))
         polygons.shapes[i] = wp.vec3i(4, 0, tile_rows - 1)
         return
     # A corner is known to a rounding of the extent: pixels by the focal length over the depth.
     diameter = wp.length(center) + wp.length(v1) + wp.length(v2)
-    blur = real(RELATIVE_MARGIN) * diameter * wp.max(intrinsics[0], intrinsics[1]) / nearest
-    margin = real(MARGIN) + real(RELATIVE_MARGIN) * size + blur
+    blur = RELATIVE_MARGIN * diameter * wp.max(intrinsics[0], intrinsics[1]) / nearest
+    margin = MARGIN + RELATIVE_MARGIN * size + blur
     # A tile's samples are its pixel centres, half a pixel inside its border.
     y0 = tile_index((low[1] - margin + HALF) / side - ONE, tile_rows)
     y1 = tile_index((high[1] + margin - HALF) / side, tile_rows)

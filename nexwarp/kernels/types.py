@@ -38,6 +38,17 @@ class TileLists:
     ends: ints
 
 
+@wp.struct
+class FixedSums:
+    """As `types(real).Sums`, in pairs of integers, see `native.fixed_point`: they do not depend on any order."""
+
+    records: wp.array2d(dtype=wp.int64)
+    errors: wp.array2d(dtype=wp.int64)
+    channels: wp.array2d(dtype=wp.int64)
+    slots: ints
+    bad: ints
+
+
 @functools.cache
 def types(real: type) -> SimpleNamespace:
     """Vector, matrix, array and struct types over `real` (wp.float32 or wp.float64), and wrapped constants."""
@@ -80,6 +91,28 @@ def types(real: type) -> SimpleNamespace:
         alphas: reals
         stops: ints
         channels: vec4_rows
+
+    @wp.struct
+    class HitGradients:
+        """Gradients of `Hits`, and the error of each pixel."""
+
+        plain: vec3s
+        base: vec3s
+        depths: real_rows
+        weights: real_rows
+        alphas: reals
+        errors: reals
+        channels: vec4_rows
+
+    @wp.struct
+    class Sums:
+        """What is added up for each surfel or gradient slot, and the flag of a term that fixed point cannot hold."""
+
+        records: vec4_rows
+        errors: reals
+        channels: vec4_rows
+        slots: ints
+        bad: ints
 
     @wp.struct
     class Surface:
@@ -136,25 +169,48 @@ def types(real: type) -> SimpleNamespace:
     return SimpleNamespace(**locals(), **{name: wp.constant(real(value)) for name, value in constants.items()})
 
 
-def per_real(**options: Any) -> Callable[[FunctionType], Callable[[type], wp.Kernel]]:
-    """Decorate a function that becomes a kernel for each scalar type: `kernel(real)`, or as `ops._interop.launch` asks.
+class PerReal:
+    """A function of Warp that is written once, and made for a scalar type and values of names of its own.
 
     In its annotations, which must be strings, and in its body `real`, `vec3`, `ONE` and so on are those of
-    `types(real)`. Options are those of `wp.kernel`; `fast_math` holds for float32 alone.
+    `types(real)`, and `names` what the call says; floats are real, and what else is written so is made for the same.
+    """
+
+    def __init__(self, make: Callable[..., Any], names: tuple[str, ...] | None, function: FunctionType) -> None:
+        self.names, self.__module__ = names, function.__module__
+
+        @functools.cache
+        def made(real: type, **values: Any) -> Any:
+            namespace = function.__globals__ | vars(types(real)) | values
+            for name in function.__code__.co_names:
+                if isinstance(value := namespace.get(name), PerReal):
+                    namespace[name] = value(real, **values)
+                elif type(value) is float:
+                    namespace[name] = wp.constant(real(value))
+            specialised = FunctionType(function.__code__, namespace)
+            specialised.__annotations__ = function.__annotations__
+            return make(specialised, real, values)
+
+        self.made = made
+
+    def __call__(self, real: type, **values: Any) -> Any:
+        """Return the kernel or function of a scalar type."""
+        return self.made(real, **values)
+
+
+def per_real(*names: str, **options: Any) -> Callable[[FunctionType], PerReal]:
+    """Decorate a function that becomes kernels, see `PerReal`; `ops._interop.launch` makes and launches them.
+
+    Options are those of `wp.kernel`, or functions that return them; `fast_math` holds for float32 alone.
     """
     fast_math = options.pop("fast_math", False)
 
-    def decorated(function: FunctionType) -> Callable[[type], wp.Kernel]:
-        @functools.cache
-        def kernel(real: type) -> wp.Kernel:
-            specialised = FunctionType(function.__code__, function.__globals__ | vars(types(real)))
-            specialised.__annotations__ = function.__annotations__
-            module_options = {"fast_math": fast_math and real is wp.float32}
-            return wp.kernel(
-                specialised, enable_backward=False, module="unique", module_options=module_options, **options
-            )
+    def make(function: FunctionType, real: type, values: dict[str, Any]) -> wp.Kernel:
+        chosen = {name: x(real, **values) if callable(x) else x for name, x in options.items()}
+        module_options = {"fast_math": fast_math and real is wp.float32}
+        return wp.kernel(function, enable_backward=False, module="unique", module_options=module_options, **chosen)
 
-        vars(kernel)["is_kernel"] = True  # of each scalar type, for who looks for all kernels
-        return functools.update_wrapper(kernel, function)
+    return functools.partial(PerReal, make, names)
 
-    return decorated
+
+func_per_real = functools.partial(PerReal, lambda function, *_: wp.func(function), None)

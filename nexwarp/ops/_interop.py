@@ -13,6 +13,7 @@ import warp as wp
 
 from nexwarp.kernels import launch as launching
 from nexwarp.kernels.tiles import LARGEST_INT
+from nexwarp.kernels.types import PerReal
 from nexwarp.native.fixed_point import HIGH, LOW
 
 # What a kernel is launched with: arrays, scalars, vectors, or None for an array that is not there.
@@ -124,7 +125,7 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
     return view
 
 
-Kernel: TypeAlias = wp.Kernel | Callable[[type], wp.Kernel]  # one of each scalar type, see `kernels.types.per_real`
+Kernel: TypeAlias = wp.Kernel | PerReal
 
 # What a kernel or a struct declares: an array's elements, and the dimensions of a tensor that holds it; or a struct.
 Declared: TypeAlias = Any
@@ -271,13 +272,14 @@ def launch(
     *,
     block_dim: int = 256,
     sharing: launching.Sharing = launching.LIGHT,
+    **names: Any,
 ) -> None:
     """Launch on the device and current stream of `like`; see `nexwarp.kernels.launch.launch`.
 
-    A kernel for each scalar type is that of the type of `like`. Tensors become arrays, and tuples and dictionaries
+    A `per_real` kernel is made for the type of `like` and `names`. Tensors become arrays, and tuples and dictionaries
     structs, of the types that the kernel declares, see `_as_declared`.
     """
-    kernel = kernel if isinstance(kernel, wp.Kernel) else kernel(real_of(like))
+    kernel = kernel if isinstance(kernel, wp.Kernel) else kernel(real_of(like), **names)
     arguments = [_as_declared(x, kind) for x, kind in zip((*inputs, *outputs), _arguments_of(kernel), strict=True)]
     device, stream = device_of(like), stream_of(like)
     launching.launch(kernel, dim, arguments, device=device, stream=stream, block_dim=block_dim, sharing=sharing)

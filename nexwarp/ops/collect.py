@@ -1,14 +1,14 @@
 """Collection pass (paper Sec. 4.2): each pixel's K heaviest hits, their plain colour, and that of all other hits."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import warp as wp
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.collect import collect_kernel
-from nexwarp.kernels.collect_backward import collect_backward_kernel, reduce_slots_kernel
+from nexwarp.kernels import collect as kernels
+from nexwarp.kernels.collect_backward import collect_backward, reduce_slots
 from nexwarp.kernels.launch import Sharing
 from nexwarp.kernels.types import MAX_HITS, types
 from nexwarp.native.staging import BLOCK_DIM
@@ -125,14 +125,14 @@ class Walked(NamedTuple):
         view = (camera.K.contiguous(), wp.vec2i(camera.width, camera.height), tiles.columns, camera.near)
         return [(self.records, self.limits, tiles.reaches, self.channels), lists, view]
 
-    def launch(self, kernel: Kernel, arguments: list[Argument]) -> None:
+    def launch(self, kernel: Kernel, arguments: list[Argument], **names: Any) -> None:
         """Launch a kernel over the pixels of all tiles, with these arguments behind those of `arguments`."""
         pixels = tile_size_on(self.records.is_cuda) ** 2  # of a tile
         threads = pixels * (len(self.tiles.tile_offsets) - 1)
         # All pixels of a tile write to its entries, so one CPU thread must walk them all.
         sharing = Sharing(smallest=pixels, align=pixels, even=False)
         everything = [*self.arguments(), *arguments]
-        launch(self.records, kernel, threads, everything, [], block_dim=BLOCK_DIM, sharing=sharing)
+        launch(self.records, kernel, threads, everything, [], block_dim=BLOCK_DIM, sharing=sharing, **names)
 
 
 class SlotSums:
@@ -154,12 +154,17 @@ class SlotSums:
         self.errors = sums_like(like, (count,), self.fixed_point) if with_errors else None
         self.channels = sums_like(like, (count, 4, 4), self.fixed_point) if with_channels else None
 
+    @property
+    def names(self) -> dict[str, bool]:
+        """What the kernels that add to it depend on."""
+        return {"fixed_point": self.fixed_point, "by_place": self.exact}
+
     def argument(self) -> Argument:
-        """The struct `Sums` of the kernels."""
-        sums = {"records": self.records, "errors": self.errors, "channels": self.channels}
-        if self.fixed_point:  # pairs of a surfel, one behind the other
-            sums = {name: None if x is None else x.flatten(1) for name, x in sums.items()}
-        return {**sums, "slots": self.tiles.entries if self.exact else None, "bad": self.bad}
+        """The fields of the struct `Sums` of the kernels, in their order."""
+        sums = self.records, self.errors, self.channels
+        # In fixed point, pairs of a surfel lie one behind the other.
+        flat = (x.flatten(1) if self.fixed_point and x is not None else x for x in sums)
+        return (*flat, self.tiles.entries if self.exact else None, self.bad)
 
     def totals(self) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
         """Sums of the records' gradients (N, 4, 4) and, where asked for, of errors (N,) and channels' (N, 4, 4)."""
@@ -177,7 +182,7 @@ class SlotSums:
             return slots
         sums = slots.new_zeros(len(self.like), *slots.shape[1:])
         inputs = [self.tiles.order, self.tiles.ends, slots, slots.shape[1]]
-        launch(slots, reduce_slots_kernel(dtype), len(self.like), inputs, [sums])
+        launch(slots, reduce_slots, len(self.like), inputs, [sums], dtype=dtype)
         return sums
 
 
@@ -199,7 +204,7 @@ class _Collect(torch.autograd.Function):
         stops = torch.empty(shape, dtype=torch.int32, device=records.device)
         more = None if channels is None else records.new_empty(*shape, 4, 4)
         outputs = (plain, base, ids, depths, weights, alphas, stops, more)
-        scene.launch(collect_kernel(scene.real, max_hits, more is not None), [outputs])
+        scene.launch(kernels.collect, [outputs], max_hits=max_hits, wide=more is not None)
         ctx.save_for_backward(*outputs)
         ctx.rest = (scene, request)
         ctx.mark_non_differentiable(ids, stops)
@@ -231,6 +236,6 @@ def _backward(
     max_hits, with_errors, wide = depths.shape[-1], errors is not None, channels is not None
     sums = SlotSums(scene.records, scene.tiles, with_errors=with_errors, with_channels=wide)
     incoming = (plain, base, depths, weights, alphas, errors, channels)
-    kernel = collect_backward_kernel(scene.real, max_hits, with_errors, sums.fixed_point, scene.tiles.exact, wide)
-    scene.launch(kernel, [outputs, incoming, sums.argument()])
+    names = {"max_hits": max_hits, "with_errors": with_errors, "wide": wide} | sums.names
+    scene.launch(collect_backward, [outputs, incoming, sums.argument()], **names)
     return sums.totals()

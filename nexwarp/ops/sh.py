@@ -3,8 +3,8 @@
 import torch
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.sh import plain_colors_kernels
-from nexwarp.ops._interop import Context, first_derivative, launch, needed, real_of
+from nexwarp.kernels import sh as kernels
+from nexwarp.ops._interop import Context, first_derivative, launch, needed
 
 
 def plain_colors(
@@ -38,8 +38,7 @@ class _PlainColors(torch.autograd.Function):
         ctx: Context, sh0: torch.Tensor, shN: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int
     ) -> torch.Tensor:
         colors = torch.empty_like(means)
-        kernel = plain_colors_kernels(real_of(means), degree).forward
-        launch(means, kernel, len(means), [sh0, shN, means, position], [colors])
+        launch(means, kernels.plain_colors, len(means), [sh0, shN, means, position], [colors], degree=degree)
         ctx.save_for_backward(shN, means, position, colors)
         ctx.rest = degree
         return colors
@@ -49,17 +48,17 @@ class _PlainColors(torch.autograd.Function):
     def backward(ctx: Context, grad_colors: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         shN, means, position, colors = ctx.saved_tensors
         need_sh0, need_shN, need_means, need_position, _ = ctx.needs_input_grad
-        kernels, count = plain_colors_kernels(real_of(means), ctx.rest), len(means)
-        seen = [means, position, colors, grad_colors.contiguous()]
+        count, degree, seen = len(means), ctx.rest, [means, position, colors, grad_colors.contiguous()]
         grad_sh0 = grad_shN = grad_means = grad_position = None
         if need_sh0 or need_shN:
             grad_sh0, grad_shN = shN.new_empty(count, 1, 3), torch.empty_like(shN)
             # Memory is what counts on CUDA, arithmetic on a CPU.
             sharing = 1 if means.device.type == "cpu" else shN.shape[1] + 1
-            launch(means, kernels.coefficients_backward, count * sharing, [sharing, *seen], [grad_sh0, grad_shN])
+            inputs, outputs = [sharing, *seen], [grad_sh0, grad_shN]
+            launch(means, kernels.plain_coefficients_backward, count * sharing, inputs, outputs, degree=degree)
         if need_means or need_position:
             grad_means = torch.empty_like(means)
-            launch(means, kernels.rays_backward, count, [shN, *seen], [grad_means])
+            launch(means, kernels.plain_rays_backward, count, [shN, *seen], [grad_means], degree=degree)
             # A ray is the surfel's centre minus the camera's.
             grad_position = -grad_means.sum(0) if need_position else None
         return needed((grad_sh0, grad_shN, grad_means, grad_position, None), ctx.needs_input_grad)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from nexwarp.kernels import surface as kernels
-from nexwarp.kernels.surface_backward import surface_backward_kernel
+from nexwarp.kernels.surface_backward import surface_backward
 from nexwarp.ops._interop import Context, contiguous, first_derivative
 from nexwarp.ops.collect import Hits, SlotSums, Walked
 from nexwarp.ops.project import Pinhole, Projection
@@ -73,6 +73,5 @@ class _Surface(torch.autograd.Function):
         scene: Walked = ctx.rest
         sums = SlotSums(scene.records, scene.tiles)
         outputs = (expected, None, None, normals, totals, picks)
-        kernel = surface_backward_kernel(scene.real, sums.fixed_point, scene.tiles.exact)
-        scene.launch(kernel, [stops, outputs, contiguous(*grads), sums.argument()])
+        scene.launch(surface_backward, [stops, outputs, contiguous(*grads), sums.argument()], **sums.names)
         return sums.totals()[0], None, None

@@ -22,12 +22,12 @@ from torch.autograd.function import once_differentiable
 from nexwarp import ops
 from nexwarp.kernels.mlp import POINTS, THREADS, layer_kernel
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Context, launch
+from nexwarp.ops._interop import Context
 from nexwarp.ops.collect import Walked
 from nexwarp.ops.neural_field import Points, Rays
 from nexwarp.ops.project import Pinhole, Projection
 from nexwarp.ops.surface import walk_surface
-from nexwarp.ops.texture import Lookup, color_kernels, colors_backward
+from nexwarp.ops.texture import Lookup, colors_backward, write_colors
 from nexwarp.ops.tiles import Tiles
 
 
@@ -272,10 +272,8 @@ def mlp(tape: wp.Tape, matrices: Sequence[wp.array], features: wp.array) -> wp.a
 class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Context, coefficients: torch.Tensor, rays: Rays, directions: torch.Tensor) -> torch.Tensor:
-        count = coefficients.shape[1]
-        colors = directions.new_empty(count, 3)
-        kernels, arguments = color_kernels(coefficients, rays, count)
-        launch(colors, kernels.forward, count, arguments, [colors])
+        colors = directions.new_empty(coefficients.shape[1], 3)
+        write_colors(colors, coefficients, rays)
         ctx.save_for_backward(coefficients)
         ctx.rest = rays
         return colors

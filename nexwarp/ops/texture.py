@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from nexwarp.kernels.hashgrid import hashgrid_kernels
-from nexwarp.kernels.sh import textured_colors_kernels
+from nexwarp.kernels.sh import textured_colors, textured_colors_backward
 from nexwarp.ops import fused_texture, mlp
 from nexwarp.ops._interop import (
     STORAGES,
@@ -86,8 +86,7 @@ class _Texture(torch.autograd.Function):
         if rays is None:
             return coefficients[:, : len(points)].to(field.grid.dtype)
         colors = torch.empty_like(points.positions)
-        kernels, arguments = color_kernels(coefficients, rays, len(points))
-        launch(colors, kernels.forward, len(points), arguments, [colors])
+        write_colors(colors, coefficients, rays)
         return colors
 
     @staticmethod
@@ -178,14 +177,19 @@ def _units(grad_encoded: torch.Tensor, unscale: torch.Tensor) -> torch.Tensor:
     return torch.exp2(torch.floor(torch.log2(2.0**46 / largest.clamp_min(1e-200)))).view(1)
 
 
-def color_kernels(coefficients: torch.Tensor, rays: Rays, count: int) -> tuple[Any, list[Argument]]:
-    """The kernels of colours along rays, and the arguments that both begin with."""
-    real, storage = real_of(rays.directions), STORAGES[coefficients.dtype]
+def _color_arguments(coefficients: torch.Tensor, rays: Rays, count: int) -> tuple[list[Argument], dict[str, Any]]:
+    """The arguments that the kernels of colours along rays begin with, and the names that they depend on."""
     if len(coefficients) not in OUTPUTS:
         raise ValueError(f"weights: expected 3 (d + 1)^2 outputs with d of 0 to 3, got {len(coefficients)}")
-    kernels = textured_colors_kernels(real, storage, OUTPUTS.index(len(coefficients)), rays.clamp)
-    hits = count // max(len(rays.directions), 1)
-    return kernels, [coefficients, rays.directions, hits, rays.offset]
+    degree, hits = OUTPUTS.index(len(coefficients)), count // max(len(rays.directions), 1)
+    names = {"storage": STORAGES[coefficients.dtype], "degree": degree, "clamp": rays.clamp}
+    return [coefficients, rays.directions, hits, rays.offset], names
+
+
+def write_colors(colors: torch.Tensor, coefficients: torch.Tensor, rays: Rays) -> None:
+    """Write the colours (n, 3) of coefficients along rays."""
+    arguments, names = _color_arguments(coefficients, rays, len(colors))
+    launch(colors, textured_colors, len(colors), arguments, [colors], **names)
 
 
 def colors_backward(
@@ -199,6 +203,7 @@ def colors_backward(
     """Write the gradient of the coefficients to `signal`, which has their padded shape; return that of directions."""
     count = len(grad_colors)
     slots = grad_colors.new_zeros(count if need_directions else 0, 3)
-    kernels, arguments = color_kernels(coefficients, rays, count)
-    launch(grad_colors, kernels.backward, count, [*arguments, scale, grad_colors], [signal, slots])
+    arguments, names = _color_arguments(coefficients, rays, count)
+    inputs = [*arguments, scale, grad_colors]
+    launch(grad_colors, textured_colors_backward, count, inputs, [signal, slots], **names)
     return slots.view(len(rays.directions), -1, 3).sum(1) if need_directions else None
