@@ -23,6 +23,7 @@ from tests.data.inputs.support import edit
 from tests.model.test_bounds import tiny_camera, tiny_model
 from tests.model_file_support import refused, rewrite
 from tests.scenes import make_camera, random_scene
+from tests.tolerances import assert_equal
 from tests.trainer_support import assert_same_state, small, trained
 
 ANYTHING = {"new": [1, {"a": None}], "x": "text", "": 0}
@@ -43,8 +44,7 @@ def test_a_model_with_unknown_keys_and_tensors_loads_the_same(tmp_path: Path) ->
 
     rewrite(file, extend)
     loaded = nw.load(file)
-    assert loaded.state_dict().keys() == expected.state_dict().keys()
-    assert all(torch.equal(x, expected.state_dict()[name]) for name, x in loaded.state_dict().items())
+    assert_equal(loaded.state_dict(), expected.state_dict())
     assert loaded.options == expected.options and loaded.meta["brightness"] == ANYTHING
     with torch.no_grad():
         assert torch.equal(loaded.render(tiny_camera()).image, expected.render(tiny_camera()).image)

@@ -34,9 +34,6 @@ def test_photo_losses_are_the_papers_total() -> None:
     image, target = x["image"].clamp(0, 1), x["target"]
     total = 0.8 * reference.l1(image, target) + 0.2 * reference.dssim(image, target)
     assert_close(terms["l1"] + terms["dssim"], total, kind="value", name="image")
-    assert_close(terms["alpha"], 0.005 * reference.alpha(x["weights"]), kind="value", name="alpha")
-    texture = 0.5 * reference.texture(x["textured"], x["weights"], target)
-    assert_close(terms["texture"], texture, kind="value", name="texture")
 
 
 @pytest.mark.parametrize(("slots", "counted"), [(1, 1), (2, 2), (3, 2), (4, 2)])
@@ -45,8 +42,8 @@ def test_the_heaviest_hits_count_as_textured(slots: int, counted: int) -> None:
     x = arguments(slots)
     x["weights"].requires_grad_()
     terms = losses.photo_losses(**x, factors=LossWeights())
-    missing = 1 - x["weights"].detach()[..., :counted].sum(-1)
-    assert_close(terms["alpha"], 0.005 * missing.mean(), kind="value", name="alpha")
+    alpha = reference.alpha(x["weights"].detach()[..., :counted])
+    assert_close(terms["alpha"], 0.005 * alpha, kind="value", name="alpha")
     (grad,) = torch.autograd.grad(terms["alpha"], x["weights"], retain_graph=True)
     assert bool((grad[..., :counted] < 0).all()) and not grad[..., counted:].any()
     texture = 0.5 * reference.texture(x["textured"], x["weights"], x["target"])
