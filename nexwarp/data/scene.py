@@ -22,6 +22,7 @@ from nexwarp.data.capture import (
     Capture,
     Cloud,
     Photo,
+    find_named,
     plain_name,
     report_missing,
     report_unused,
@@ -37,8 +38,8 @@ from nexwarp.data.in_memory import as_bytes, make_cloud, near_origin, split_view
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.ply import read_ply
 from nexwarp.data.random_points import random_points
-from nexwarp.data.transforms import BLENDER_FILES, NERFSTUDIO_FILE, read_blender, read_nerfstudio
-from nexwarp.data.views import PlannedView, View, ViewReader, find_mask
+from nexwarp.data.transforms import BLENDER_FILES, EXTENSIONS, NERFSTUDIO_FILE, read_blender, read_nerfstudio
+from nexwarp.data.views import PlannedView, View, ViewReader
 from nexwarp.errors import MissingError
 from nexwarp.io.pictures import save_png
 from nexwarp.machine import available_memory
@@ -529,7 +530,9 @@ def _with_masks(path: Path, photos: list[Photo], masks: str | None) -> list[Phot
     if masks == MASKS and (any(photo.mask for photo in photos) or not (path / masks).is_dir()):
         return photos
     _check_folder("masks", path, masks)
-    photos = [dataclasses.replace(photo, mask=find_mask(path / masks, photo.name)) for photo in photos]
+    photos = [
+        dataclasses.replace(photo, mask=find_named(path / masks, photo.name, (".png",), EXTENSIONS)) for photo in photos
+    ]
     if not any(photo.mask for photo in photos):
         raise FileNotFoundError(
             f"masks: none in {path / masks} is named after a photo, expected {Path(photos[0].name).name}.png, say, "

@@ -12,7 +12,7 @@ import torch
 from torch.utils.data._utils.collate import collate, default_collate_fn_map
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.data.capture import Photo, find_named
+from nexwarp.data.capture import Photo
 from nexwarp.data.depth_files import read_depth
 from nexwarp.data.images import (
     compose,
@@ -27,7 +27,6 @@ from nexwarp.data.images import (
 from nexwarp.data.lens import FACES, PANORAMA, Intrinsics, Lens, Map, undistortion
 from nexwarp.io.files import one_line
 
-MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".PNG", ".JPG", ".JPEG")
 OPAQUE = 255
 # A side larger than both, the ratio in those of the camera, is refused before decoding.
 MAX_ENLARGED, SMALL = 16, 1024
@@ -197,11 +196,6 @@ def _face(photo: Photo, face: str) -> Photo:
     turn[:3, :3] = FACES[face]
     named = str(name.with_name(f"{name.stem}_{face}{name.suffix}"))
     return dataclasses.replace(photo, name=named, viewmat=turn @ photo.viewmat, face=face)
-
-
-def find_mask(folder: Path, name: str) -> Path | None:
-    """Find the mask of a photo in a folder: its name with ".png" appended, or its stem with another suffix, or None."""
-    return find_named(folder, name, (".png",), MASK_SUFFIXES)
 
 
 def _mask(photo: Photo, image: torch.Tensor, alpha: torch.Tensor | None) -> torch.Tensor | None:

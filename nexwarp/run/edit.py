@@ -9,8 +9,6 @@ from typing import Annotated
 import numpy as np
 import torch
 
-from nexwarp.cameras.camera import Camera
-from nexwarp.cameras.cameras_file import CAMERAS_FILE
 from nexwarp.cameras.paths import focus_ahead, subject
 from nexwarp.cameras.similarity import Similarity, upright
 from nexwarp.data.option import Flag_, option
@@ -78,7 +76,7 @@ class EditOrder:
     def edit(self, opened: OpenedModel, device: torch.device | str, observe: Progress = lambda *_: None) -> Edit | None:
         """Return the operation on a run, None for nothing to do; `device` and `observe` are for --remove-floaters."""
         if self.remove_floaters:
-            found = find_floaters(opened.model.to(device), _training_cameras(opened), observe).numpy()
+            found = find_floaters(opened.model.to(device), opened.trained_cameras, observe).numpy()
             removed = opened.kept.nonzero()[0][found]
             return Edit(REMOVE, (checksum(opened.trained.surfels), *removed.tolist())) if found.any() else None
         if self.level:
@@ -91,19 +89,13 @@ class EditOrder:
         return self._given()
 
 
-def _training_cameras(opened: OpenedModel) -> list[Camera]:
-    if not (cameras := opened.cameras.get(TRAIN)):
-        raise RunError(f"{opened.folder / CAMERAS_FILE}: expected training cameras, found none")
-    return [*cameras.values()]
-
-
 def _levelling(opened: OpenedModel) -> Similarity:
     """Return the motion from a run's coordinates to levelled ones.
 
     A fifth of the level surfels, by opacity, lies below the ground: of those below the middle of the cameras, and not
     much farther from it than they are.
     """
-    cameras = [opened.frame.camera(camera) for camera in _training_cameras(opened)]
+    cameras = [opened.frame.camera(camera) for camera in opened.trained_cameras]
     turn = Similarity(upright(cameras), np.zeros(3))
     surfels = moved_surfels(opened.model.surfels, opened.frame.then(turn))
     places = turn.points(np.stack([camera.position.numpy() for camera in cameras]))
@@ -123,8 +115,7 @@ def described(opened: OpenedModel) -> list[str]:
     low, high = (" ".join(f"{x:.4g}" for x in row) for row in np.quantile(means, MIDDLE, axis=0))
     count = f"{opened.kept.sum():,} of {len(opened.kept):,} surfels"
     lines = [f"{count}; nine of ten along each axis: {low} to {high}"]
-    has_cameras = opened.source is None or (opened.folder / CAMERAS_FILE).is_file()
-    cameras = [opened.frame.camera(x) for x in opened.cameras.get(TRAIN, {}).values()] if has_cameras else []
+    cameras = [opened.frame.camera(x) for x in opened.cameras.get(TRAIN, {}).values()]
     target, share = focus_ahead(cameras)
     if share == 1:
         places = torch.stack([camera.position.double() for camera in cameras])
@@ -156,7 +147,7 @@ def measured(opened: OpenedModel, points: np.ndarray, length: float) -> list[str
 
 def subject_crop(opened: OpenedModel) -> Edit | None:
     """Return the crop to what the training cameras look at from all around, None where they do not."""
-    ball = subject(_training_cameras(opened))
+    ball = subject(opened.trained_cameras)
     if ball is None:
         return None
     return Edit("sphere", (*opened.frame.points(ball[0].numpy()).tolist(), ball[1] * opened.frame.scale))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from statistics import fmean
-from typing import Any, TypedDict, cast
+from typing import Any, cast
 
 import torch
 from safetensors import SafetensorError
@@ -39,17 +39,6 @@ SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of ImageNet's 
 Values = dict[str, float | None]  # of a view, by metric
 
 
-class Evaluation(TypedDict, total=False):
-    """The requested metrics of held-out views; flip and lpips are None where their packages are not installed."""
-
-    psnr: float  # means over the views, dB
-    ssim: float  # at most 1
-    flip: float | None  # 0 to 1, lower is better
-    lpips: float | None  # lower is better
-    views: dict[str, Values]  # by view name
-    convention: str  # how the metrics are computed
-
-
 @torch.no_grad()
 def evaluate(
     model: Model,
@@ -60,8 +49,11 @@ def evaluate(
     metrics: Sequence[str] = ("psnr", "ssim"),
     progress: Callable[[str], None] | None = None,
     ranks: Ranks | None = None,
-) -> Evaluation:
+) -> dict[str, Any]:
     """Render views, on the model's device, and compare them with their photos.
+
+    Return the metrics, means over the views; flip and lpips are None where their packages or weights are missing. Also
+    `views`, the metrics of each by name, and `convention`, how they are computed.
 
     Args:
         model: what is rendered.
@@ -100,7 +92,7 @@ def evaluate(
     for name in metrics:
         known = [value for values in results.values() if (value := values[name]) is not None]
         summary[name] = fmean(known) if len(known) == len(results) else None
-    return cast(Evaluation, summary)
+    return summary
 
 
 def _judge(model: Model, view: View, mask_mode: str, metrics: Sequence[str]) -> tuple[torch.Tensor, Values]:

@@ -174,8 +174,7 @@ def export_run(
 
 def _cropped(opened: OpenedModel, report: Callable[[str], object]) -> OpenedModel:
     """Return a run, of an object without what lies far around it unless it is cropped already; say what is left."""
-    has_cameras = (opened.folder / CAMERAS_FILE).is_file() and opened.cameras.get(TRAIN)
-    if not has_cameras or _is_cropped(opened) or (crop := subject_crop(opened)) is None:
+    if not opened.cameras.get(TRAIN) or _is_cropped(opened) or (crop := subject_crop(opened)) is None:
         return opened
     rest = edited(opened, crop)
     whole, size = (np.ptp(x.frame.points(x.model.surfels.means.detach().cpu().numpy()), axis=0) for x in (opened, rest))
@@ -202,24 +201,18 @@ def _export(
 ) -> Sequence[Path]:
     """Write the files of a format."""
     files = [folder / name for name in EXPORTS[order.format]]
-    views: dict[str, Camera] = {}
-    # A training that stopped early leaves no cameras file.
-    if order.format not in ("compact", "mesh", "cameras") and (opened.folder / CAMERAS_FILE).is_file():
-        views = {name: camera for members in opened.cameras.values() for name, camera in members.items()}
+    views = {name: camera for members in opened.cameras.values() for name, camera in members.items()}
     # What is baked learns from no test view, not even from its pose.
-    seen: Views = scene.train if scene is not None else [*opened.cameras.get(TRAIN, {}).values()] if views else []
+    seen: Views = scene.train if scene is not None else [*opened.cameras.get(TRAIN, {}).values()]
     if order.format == "web":
         model, out, page = opened.model.to(device), order.out or files[0], _page(opened, order)
         return export_web(model, views, out, seen, quality=order.quality, page=page, progress=observe)
     if order.format == "cameras":
         _export_cameras(opened, *files)
     elif order.format == "mesh":
-        trained = opened.cameras.get(TRAIN, {})
-        if not trained:
-            raise RunError(f"{opened.folder / CAMERAS_FILE}: expected training cameras, found none")
         model, scale = opened.model.to(device), opened.frame.scale
         voxel, far = (None if x is None else x / scale for x in (order.voxel, order.far))
-        mesh = extract_mesh(model, [*trained.values()], voxel=voxel, far=far, observe=observe)
+        mesh = extract_mesh(model, opened.trained_cameras, voxel=voxel, far=far, observe=observe)
         save_mesh(files[0], mesh.moved(opened.frame))
     elif order.format == "compact":
         save_model(files[0], opened.model, compact=_noise(opened) if order.noise is None else order.noise)
@@ -286,7 +279,7 @@ def _collision(opened: OpenedModel, device: torch.device | str, observe: Progres
     model = opened.model.to(device)
     low, high = np.quantile(model.surfels.means.detach().cpu().numpy(), MIDDLE, axis=0)
     voxel = float((high - low).max()) / COLLISION_VOXELS
-    mesh = extract_mesh(model, [*opened.cameras.get(TRAIN, {}).values()], voxel=voxel, observe=observe)
+    mesh = extract_mesh(model, opened.trained_cameras, voxel=voxel, observe=observe)
     return mesh.moved(opened.frame)
 
 
@@ -323,7 +316,7 @@ def _photos(opened: OpenedModel, device: torch.device | str, observe: Progress) 
     for views in (scene.train, scene.test):
         shown = [(view, *compared(opened.model, view, mode)) for view in views]
         groups.append([replace(view, image=image, mask=mask, alpha=None) for view, image, mask in shown])
-    cameras = opened.cameras.get(TRAIN, {}) if (opened.folder / CAMERAS_FILE).is_file() else {}
+    cameras = opened.cameras.get(TRAIN, {})
     groups[0] = [replace(view, camera=cameras.get(view.name, view.camera)) for view in groups[0]]
     if _is_cropped(opened):
         models = [model.bare().to(device) for model in (opened.trained, opened.model)]

@@ -295,20 +295,14 @@ def create_run(run: Path, record: RunRecord) -> list[str]:
 
 
 def update_run(run: Path, record: RunRecord) -> None:
-    """Write what a resumed run changes into its config: places of scene and teachers, and the number of iterations.
-
-    The scene's place goes into the configs of the run's own teachers, too. Other entries stay.
-    """
-    teachers = {folder: read_run(folder) for folder in teacher_folders(run) if is_run(folder)}
-    moved = {folder: dataclasses.replace(old, source=record.source) for folder, old in teachers.items()}
-    for folder, new in {run: record, **moved}.items():
-        before = read_json(folder / CONFIG_FILE)
-        names = ["scene", "teachers"]
-        if new.config.iterations != read_run(folder).config.iterations:
-            names.append("config")
-        after = before | {name: value for name, value in new.as_dict().items() if name in names}
-        if after != before:
-            write_json(folder / CONFIG_FILE, after)
+    """Write what a resumed run changes into its config: places of scene and teachers, and the number of iterations."""
+    before = read_json(run / CONFIG_FILE)
+    changed = ["scene", "teachers"]
+    if record.config.iterations != read_run(run).config.iterations:
+        changed.append("config")
+    after = before | {name: value for name, value in record.as_dict().items() if name in changed}
+    if after != before:
+        write_json(run / CONFIG_FILE, after)
 
 
 def check_teachers_place(run: Path, count: int) -> None:
@@ -459,14 +453,20 @@ class OpenedModel:
 
     @cached_property
     def cameras(self) -> dict[str, dict[str, Camera]]:
-        """Cameras by set and name; none for a model alone without `cameras.json`. MissingError for a run without it."""
-        if self.source is None and not (self.folder / CAMERAS_FILE).is_file():
-            return {}
-        return load_cameras(self.folder / CAMERAS_FILE)
+        """Cameras by set and name; none without `cameras.json`, as of a model alone or an unfinished training."""
+        file = self.folder / CAMERAS_FILE
+        return load_cameras(file) if file.is_file() else {}
+
+    @property
+    def trained_cameras(self) -> list[Camera]:
+        """The training cameras; RunError where there are none."""
+        if not (cameras := self.cameras.get(TRAIN)):
+            raise RunError(f"{self.folder / CAMERAS_FILE}: expected training cameras, found none")
+        return [*cameras.values()]
 
     def path_cameras(self) -> dict[str, dict[str, Camera]]:
-        """Return the cameras that a path is made of; for a model without any, a ring around its surfels."""
-        if self.source is not None or any(self.cameras.values()):
+        """Return the cameras that a path is made of; without any, a ring around the surfels."""
+        if any(self.cameras.values()):
             return self.cameras
         ring = surrounding(self.model.surfels.means, near_depth(self.model))
         return {"train": {f"around_{index:02d}": camera for index, camera in enumerate(ring)}}

@@ -275,7 +275,7 @@ def test_bad_exports(refuses: Callable[..., None], run: Path, tmp_path: Path) ->
     refuses(["export", "--format", "cameras"], "cameras.json: expected at least one camera, found none")
     refuses(["render", "--set", "test"], "cameras.json: expected test views to render, found none")
     (run / "cameras.json").unlink()
-    refuses(["export", "--format", "cameras"], "cameras.json: expected the run's cameras")
+    refuses(["export", "--format", "cameras"], "cameras.json: expected at least one camera, found none")
     (run / "model.safetensors").unlink()
     refuses(["export"], "model.safetensors")
     (run / "config.json").unlink()

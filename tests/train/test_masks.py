@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.run.evaluate import Evaluation, evaluate
+from nexwarp.run.evaluate import evaluate
 from nexwarp.train.target import mean_color
 from tests.tolerances import assert_close
 from tests.trainer_support import TEXTURE
@@ -68,7 +68,7 @@ def test_masks_take_part_in_the_judgement(scene: nw.Scene) -> None:
     spoilt = dataclasses.replace(view, image=torch.where(mask[..., None], view.image, 255 - view.image))
     model = trainer.model()
 
-    def judge(*views: nw.View, mode: str = "ignore") -> Evaluation:
+    def judge(*views: nw.View, mode: str = "ignore") -> dict[str, Any]:
         return evaluate(model, views, mask_mode=mode, metrics=("psnr", "ssim", "flip"))
 
     one, other = judge(view), judge(spoilt)
