@@ -11,17 +11,30 @@ read. Written, with w = alpha * transmittance the weight (paper Sec. 4.2), t the
 All are 0 where nothing is hit. `surface_backward` differentiates all four. It needs `totals`, the sum of w, and
 `picks`, the places in the list of the hits of the median and the top depth, -1 where nothing is hit; both may be left
 out.
+
+`surface_backward` is the derivative, front to back in one pass, as `collect_backward` is that of `collect`. It adds
+gradients to the surfels' records, in the slots of `collect_backward`. With q_i = dL/dw_i, E the expected depth, W the
+sum of weights and N the blended normal, the terms of a hit are
+
+    q_i       gE (t_i - E) / W + gN . n_i
+    dL/dt_i   gE w_i / W, and the gradients of the median and of the top depth where the hit is the one that they are
+              taken from
+    dL/dn_i   gN w_i
+
+and sum of q_i w_i = gN . N starts the recurrence that gives dL/dalpha_i, see `collect_backward`. Frozen: what is frozen
+for `collect_backward`, which hits the median and the top depth are taken from, and the sides of the normals.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from nexwarp.kernels.surfel import facing_side, hit, hit_alpha
-from nexwarp.kernels.types import TileLists, ints, per_real
+from nexwarp.kernels.collect_backward import add
+from nexwarp.kernels.surfel import facing_side, hit, hit_alpha, hit_gradients, record_gradients
+from nexwarp.kernels.types import FixedSums, TileLists, ints, per_real
 from nexwarp.kernels.walk import block_of, candidate, overflowed, pixel_of, tile_of, walk
 from nexwarp.native.vector_loads import load_record
-from nexwarp.native.warp import ballot, from_lane, lane_index, lowest_lane, warp_max, warp_size
+from nexwarp.native.warp import any_in_warp, ballot, from_lane, lane_index, lowest_lane, warp_max, warp_size
 
 
 @per_real(grid_stride=False, fast_math=True)
@@ -81,3 +94,72 @@ def surface(first: int, surfels: Surfels, lists: TileLists, view: View, stops: i
     if surface.picks:
         surface.totals[p] = total
         surface.picks[p] = pick
+
+
+@per_real("fixed_point", "by_place", grid_stride=False, fast_math=True)
+def surface_backward(
+    first: int,
+    surfels: Surfels,
+    lists: TileLists,
+    view: View,
+    stops: ints,
+    surface: Surface,
+    grads: Surface,
+    sums: FixedSums if fixed_point else Sums,
+):
+    thread = first + wp.tid()
+    xy, inside, d = pixel_of(thread, view)
+    middle, half = block_of(xy, view)
+    # Threads outside the image walk along without a hit: all lanes of a warp must reach the sums together.
+    p = wp.min(xy[1], view.size[1] - 1) * view.size[0] + wp.min(xy[0], view.size[0] - 1)
+    stop = stops[p]
+    if not inside:
+        stop = int(0)
+    grad_normals = grads.normals[p]
+    # What is left of the sum over the hits behind.
+    rest = wp.dot(grad_normals, surface.normals[p])
+    mean = surface.expected[p]
+    grad_mean = real(0.0)
+    if surface.totals[p] > ZERO:
+        grad_mean = grads.expected[p] / surface.totals[p]
+    transmittance = real(1.0)
+    overflow = overflowed(lists)
+    bounds = walk(tile_of(thread), lists, overflow)
+    width = warp_size()
+    lane = lane_index()
+    last = wp.min(warp_max(stop), bounds[1])
+    for batch in range(bounds[0], last, width):
+        mine = candidate(batch + lane, last, surfels, lists, overflow, middle, half)
+        left = ballot(wp.where(mine >= 0, 1, 0))
+        while left != 0:
+            source = lowest_lane(left)
+            left = left & (left - 1)
+            i = from_lane(mine, source)
+            k = batch + source
+            a, b, n, c = load_record(surfels.records, i)
+            u, v, depth = hit(a, b, n, c[3], d)
+            alpha = hit_alpha(a, b, n, u, v, surfels.limits[i])
+            if not (k < stop and alpha >= ALPHA_MIN and depth > view.near):
+                alpha = ZERO
+            if any_in_warp(wp.where(alpha > ZERO, 1, 0)) != 0:
+                grad = vec7()
+                grad_normal = vec3()
+                if alpha > ZERO:
+                    weight = alpha * transmittance
+                    normal = vec3(n[0], n[1], n[2])
+                    facing = facing_side(n, d)
+                    grad_normal = grad_normals * (facing * weight)
+                    q = grad_mean * (depth - mean) + facing * wp.dot(grad_normals, normal)
+                    grad_depth = grad_mean * weight
+                    if k == surface.picks[p][0]:
+                        grad_depth += grads.median[p]
+                    if k == surface.picks[p][1]:
+                        grad_depth += grads.top[p]
+                    rest -= q * weight
+                    grad_alpha = transmittance * q - rest / (ONE - alpha)
+                    grad = hit_gradients(a, b, n, c[3], d, grad_alpha, grad_depth)
+                transmittance = transmittance * (ONE - alpha)
+                row_a, row_b, row_n = record_gradients(grad, d)
+                row_n += vec4(grad_normal[0], grad_normal[1], grad_normal[2], ZERO)
+                row_c = vec4(ZERO, ZERO, ZERO, grad[3])
+                add(sums, i, k, row_a, row_b, row_n, row_c)

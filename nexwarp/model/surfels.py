@@ -21,7 +21,15 @@ COEFFICIENTS = tuple((degree + 1) ** 2 for degree in range(MAX_SH_DEGREE + 1))  
 END = 1e-6
 SOFT = -5.0  # raw gamma of kernels that are all but Gaussian, and that a training can still sharpen
 
-PARAMETERS = ("means", "raw_quats", "log_scales", "logit_opacities", "raw_gammas", "sh0", "shN")
+PARAMETERS: dict[str, tuple[int | str, ...]] = {  # and their shapes
+    "means": ("N", 3),
+    "raw_quats": ("N", 4),
+    "log_scales": ("N", 2),
+    "logit_opacities": ("N",),
+    "raw_gammas": ("N", 2),
+    "sh0": ("N", 1, 3),
+    "shN": ("N", "C - 1", 3),
+}
 
 
 class Activated(NamedTuple):
@@ -55,20 +63,11 @@ class Surfels(nn.Module):
     def __init__(self, raw: dict[str, torch.Tensor]) -> None:
         """Take the raw values by parameter name, as `state_dict` returns them."""
         super().__init__()
-        shapes = {
-            "means": ("N", 3),
-            "raw_quats": ("N", 4),
-            "log_scales": ("N", 2),
-            "logit_opacities": ("N",),
-            "raw_gammas": ("N", 2),
-            "sh0": ("N", 1, 3),
-            "shN": ("N", "C - 1", 3),
-        }
-        if raw.keys() != shapes.keys():
-            raise ValueError(f"raw: expected the keys {sorted(shapes)}, got {sorted(raw)}")
-        check_tensors({name: (raw[name], shape) for name, shape in shapes.items()})
+        if raw.keys() != PARAMETERS.keys():
+            raise ValueError(f"raw: expected the keys {sorted(PARAMETERS)}, got {sorted(raw)}")
+        check_tensors({name: (raw[name], shape) for name, shape in PARAMETERS.items()})
         check_coefficients("shN", raw["shN"].shape[1] + 1)
-        for name in shapes:
+        for name in PARAMETERS:
             self.register_parameter(name, nn.Parameter(raw[name]))
 
     @classmethod

@@ -96,22 +96,15 @@ def expose(
     for name, x in (("exposure", exposure), ("photo", photo)):
         if x.requires_grad:
             raise ValueError(f"{name}: expected a tensor that needs no gradient, got requires_grad=True")
-    return _Expose.apply(*(x.contiguous() for x in (image, textured, exposure, photo)), saturation)
+    return _Expose.apply(saturation, *contiguous(image, textured, exposure, photo))
 
 
 class _Expose(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Context,
-        image: torch.Tensor,
-        textured: torch.Tensor,
-        exposure: torch.Tensor,
-        photo: torch.Tensor,
-        saturation: float,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(ctx: Context, saturation: float, *tensors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        image, textured, exposure, photo = tensors
         exposed, exposed_colors = torch.empty_like(image), torch.empty_like(textured)
-        inputs = [image, textured, exposure, photo, saturation]
-        launch(image, kernels.expose, photo.numel() // 3, inputs, [exposed, exposed_colors])
+        launch(image, kernels.expose, photo.numel() // 3, [*tensors, saturation], [exposed, exposed_colors])
         ctx.save_for_backward(image, exposure, photo)
         ctx.rest = saturation
         ctx.set_materialize_grads(False)
@@ -127,7 +120,7 @@ class _Expose(torch.autograd.Function):
         results = [None if x is None else torch.empty_like(x) for x in grads]
         inputs = [image, exposure, photo, ctx.rest, *grads]
         launch(image, kernels.expose_backward, photo.numel() // 3, inputs, results)
-        return *results, None, None, None
+        return None, *results, None, None
 
 
 def depth_term(
@@ -153,24 +146,18 @@ def depth_term(
     shape: tuple[int | str, ...] = ("H", "W") if places is None else ("M",)
     hits = ("H", "W", "K")
     check_tensors({"depths": (depths, hits), "weights": (weights, hits), "expected": (expected, shape)})
-    return _DepthTerm.apply(*contiguous(depths, weights, expected, places), factor)
+    return _DepthTerm.apply(factor, *contiguous(depths, weights, expected, places))
 
 
 class _DepthTerm(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Context,
-        depths: torch.Tensor,
-        weights: torch.Tensor,
-        expected: torch.Tensor,
-        places: torch.Tensor | None,
-        factor: float,
-    ) -> torch.Tensor:
+    def forward(ctx: Context, factor: float, *tensors: torch.Tensor | None) -> torch.Tensor:
+        depths, _weights, expected, _places = tensors
+        assert depths is not None and expected is not None
         sums, threads = _warp_sums(depths, 2, expected.numel())
-        inputs = [depths, weights, expected, places, factor]
-        launch(depths, kernels.depth_errors, threads, inputs, [sums])
+        launch(depths, kernels.depth_errors, threads, [*tensors, factor], [sums])
         totals = sums.sum(1)
-        ctx.save_for_backward(depths, weights, expected, places, totals)
+        ctx.save_for_backward(*tensors, totals)
         ctx.rest = factor
         return totals[0] / totals[1].clamp_min(1)
 
@@ -181,4 +168,4 @@ class _DepthTerm(torch.autograd.Function):
         grads = [torch.empty_like(x) for x in tensors[:2]]
         inputs, pixels = [*tensors, ctx.rest, totals, grad], grads[0].shape[0] * grads[0].shape[1]
         launch(totals, kernels.depth_errors_backward, pixels, inputs, grads)
-        return (*needed(grads, ctx.needs_input_grad[:2]), None, None, None)
+        return None, *needed(grads, ctx.needs_input_grad[1:3]), None, None

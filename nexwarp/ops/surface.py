@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import torch
 
 from nexwarp.kernels import surface as kernels
-from nexwarp.kernels.surface_backward import surface_backward
 from nexwarp.ops._interop import Context, contiguous, first_derivative
 from nexwarp.ops.collect import Hits, SlotSums, Walked
 from nexwarp.ops.project import Pinhole, Projection
@@ -73,5 +72,5 @@ class _Surface(torch.autograd.Function):
         scene: Walked = ctx.rest
         sums = SlotSums(scene.records, scene.tiles)
         outputs = (expected, None, None, normals, totals, picks)
-        scene.launch(surface_backward, [stops, outputs, contiguous(*grads), sums.argument()], **sums.names)
+        scene.launch(kernels.surface_backward, [stops, outputs, contiguous(*grads), sums.argument()], **sums.names)
         return sums.totals()[0], None, None
