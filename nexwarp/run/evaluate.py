@@ -88,7 +88,7 @@ def evaluate(
                     save(renders / COMPARE / picture_name(view.name), strip)
                 if progress is not None:
                     progress(view.name)
-    summary: dict[str, Any] = {"views": results, "convention": CONVENTION}
+    summary: dict[str, object] = {"views": results, "convention": CONVENTION}
     for name in metrics:
         known = [value for values in results.values() if (value := values[name]) is not None]
         summary[name] = fmean(known) if len(known) == len(results) else None

@@ -10,7 +10,7 @@ from functools import partial
 from itertools import combinations, product
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from nexwarp.data.colmap import read_model
 from nexwarp.data.images import read_image
@@ -284,7 +284,11 @@ class Stages:
         return self._mapped(pycolmap.global_mapping, pycolmap.GlobalPipelineOptions(), "global", lambda: None)
 
     def _mapped(
-        self, run: Callable[..., dict[int, Any]], options: Any, name: str, watch: Callable[[], None]
+        self,
+        run: Callable[..., dict[int, "pycolmap.Reconstruction"]],
+        options: "pycolmap.IncrementalPipelineOptions | pycolmap.GlobalPipelineOptions",
+        name: str,
+        watch: Callable[[], None],
     ) -> dict[int, "pycolmap.Reconstruction"]:
         options.num_threads = options.mapper.num_threads = self.threads
         options.random_seed = options.mapper.random_seed = self.options.seed
