@@ -67,7 +67,7 @@ MUTATIONS = [
     Mutation("data/colmap.py", "2 * (x * y - w * z), 2 * (x * z + w * y)),", "2 * (x * y + w * z), 2 * (x * z + w * y)),", "tests/data/test_scene.py"),
     Mutation("data/colmap.py", "models[0] if len(models) == 1 else max(", "models[0] if models else max(", "tests/data"),
     Mutation("data/images.py", "WHITE = 128", "WHITE = 200", "tests/data/inputs/test_masks.py"),
-    Mutation("cameras/nerfstudio.py", "pose[:3, 3] /= scale", "pose[:3, 3] *= scale", "tests/cameras/test_files.py"),
+    Mutation("data/transforms.py", "applied[:3] *= number_of(", "applied[:3] /= number_of(", "tests/data/inputs/test_formats.py -k applied"),
     Mutation("cameras/nerfstudio.py", "for values in (frame, file):\n        for axis", "for values in (file, frame):\n        for axis", "tests/data/inputs/test_transforms.py"),
     Mutation("cameras/ray_camera.py", "(x / width - 0.5) * 2", "(0.5 - x / width) * 2", "tests/cameras/test_ray_cameras.py"),
     Mutation("cameras/camera.py", "return (depths > 0) &", "return (depths > -1e9) &", "tests/cameras tests/train/test_losses.py -k 'visible or points'"),
