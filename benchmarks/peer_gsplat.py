@@ -166,7 +166,7 @@ def train(
     for step in range(iterations):
         order = order or torch.randperm(len(views)).tolist()
         index = order.pop()
-        camera, photo = views.get(index, order[:-3:-1])
+        camera, photo = views.get(index)
         degree = min(step // max(round(SH_EVERY * stretch), 1), SH_DEGREE)
         image, info = gaussians.render(camera, degree)
         control.before(step, info)

@@ -95,8 +95,7 @@ class ParallelTrainer(Trainer):
         self.iteration += self.views_a_step
         for offset, generator in enumerate((self.targets.generator, self.targets.noise)):
             generator.manual_seed(derived_seed(self.config.seed, first + mine + 1, offset))
-        upcoming = self.order[-1 - ranks.rank :: -ranks.size][:2]
-        return self.targets.make(chosen[mine], first + mine + 1, upcoming)
+        return self.targets.make(chosen[mine], first + mine + 1)
 
     def _run_step(self, target: Target) -> StepResult:
         result = super()._run_step(target)

@@ -9,7 +9,6 @@ import dataclasses
 import hashlib
 import weakref
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -33,7 +32,6 @@ from nexwarp.train.state import TrainingState
 
 # Photos stay on the GPU when they take less than this share of its free memory.
 PHOTO_SHARE = 0.25
-AHEAD = 2  # photos to fetch meanwhile where they do not
 VALUES_A_THREAD = 500_000
 EVERY = 2  # the second of so many steps learns from a teacher: the log's lines are of odd steps, which have photos
 STREAM = 2  # series of random numbers, as `derived_seed` counts them; those of a view's target are 0 and 1
@@ -110,10 +108,10 @@ class TargetSource:
             state.order = torch.randperm(len(self.views), generator=state.generator).tolist()
         return state.order.pop()
 
-    def make(self, index: int, number: int, upcoming: list[int]) -> Target:
-        """Make the target of a step with view `index`, number `number` of the training, before the `upcoming` ones."""
+    def make(self, index: int, number: int) -> Target:
+        """Make the target of a step with view `index`, number `number` of the training."""
         config, iteration = self.config, self.state.iteration
-        target = self.with_depth(self.with_points(self.from_view(index, upcoming), index), index)
+        target = self.with_depth(self.with_points(self.from_view(index), index), index)
         target = dataclasses.replace(target, normals=config.normals_at(iteration))
         if config.depth_jitter > 0 and config.max_hits:
             hits = config.hits_at(iteration)
@@ -123,9 +121,9 @@ class TargetSource:
             target = dataclasses.replace(target, view=torch.tensor([index], device=self.views.device))
         return target
 
-    def from_view(self, index: int, upcoming: Sequence[int] = ()) -> Target:
+    def from_view(self, index: int) -> Target:
         """Make the target of a view: photo, background and mask."""
-        camera, photo = self.views.get(index, upcoming)
+        camera, photo = self.views.get(index)
         background = self.background_tensor
         if self.scene.random_background:
             drawn = torch.rand(3, generator=self.generator)
@@ -225,9 +223,9 @@ class TaughtTargets(TargetSource):
         """Return the index of the training view with that number in the training, from 1."""
         return self.choice(number)[0] if self.teaches(number) else super().next_view(number)
 
-    def make(self, index: int, number: int, upcoming: list[int]) -> Target:
+    def make(self, index: int, number: int) -> Target:
         """Make the target of a step, with the photo or with a teacher's rendering."""
-        target = super().make(index, number, upcoming)
+        target = super().make(index, number)
         return self.repeatable(partial(self.taught, target, number)) if self.teaches(number) else target
 
     def taught(self, of_photo: Target, number: int) -> Target:
@@ -280,8 +278,8 @@ def check_teachers(teachers: Iterable[Model], scene: Scene, config: Config) -> l
 class TrainingViews:
     """Training views on the device they are used on; photos stay 8-bit.
 
-    Where photos take a quarter of the GPU's free memory or more, they stay in host memory, and a thread copies the next
-    ones to the GPU while a step runs, through pinned memory and on its own CUDA stream.
+    Where photos take a quarter of the GPU's free memory or more, they stay in host memory, and each step copies its own
+    through pinned memory, without waiting for it.
     """
 
     def __init__(
@@ -300,16 +298,11 @@ class TrainingViews:
         self.photos = [view.image for view in views]
         self.depths = [view.depth for view in views]
         self.has_depths = any(depth is not None for depth in self.depths)
-        self.pool: ThreadPoolExecutor | None = None
-        self.coming: dict[int, Future[tuple[torch.Tensor, torch.cuda.Event]]] = {}
         if device.type == "cuda":
             free, _ = torch.cuda.mem_get_info(device)
             if sum(x.nbytes for x in (*self.photos, *self.depths) if x is not None) < PHOTO_SHARE * free:
                 self.photos = [p.to(device) for p in self.photos]
                 self.depths = [None if depth is None else depth.to(device) for depth in self.depths]
-            else:
-                self.pool = ThreadPoolExecutor(1, "photos")
-                self.stream = torch.cuda.Stream(device)
 
     def __len__(self) -> int:
         return len(self.photos)
@@ -334,10 +327,11 @@ class TrainingViews:
             digest.update(f"{view.name} {values}\n".encode())
         return digest.hexdigest()
 
-    def get(self, index: int, ahead: Sequence[int] = ()) -> tuple[Camera, torch.Tensor]:
-        """Return camera and photo (H, W, 3) float in [0, 1] of a view; copy those of the next views, `ahead`."""
-        photo = self._on_device(index)
-        self._fetch(ahead[:AHEAD])
+    def get(self, index: int) -> tuple[Camera, torch.Tensor]:
+        """Return camera and photo (H, W, 3) float in [0, 1] of a view."""
+        photo = self.photos[index]
+        if photo.device.type != self.device.type:
+            photo = photo.pin_memory().to(self.device, non_blocking=True)
         return self.cameras[index], photo / 255.0
 
     def exposure(self, index: int) -> torch.Tensor | None:
@@ -365,32 +359,6 @@ class TrainingViews:
         if depth is None:  # zeros: one CUDA graph serves all photos
             return torch.zeros(camera.height, camera.width, device=self.device)
         return depth.to(self.device, non_blocking=True).float()
-
-    def _on_device(self, index: int) -> torch.Tensor:
-        coming = self.coming.pop(index, None)
-        if coming is None:
-            return self.photos[index].to(self.device)
-        photo, copied = coming.result()
-        here = torch.cuda.current_stream(self.device)
-        here.wait_event(copied)
-        photo.record_stream(here)
-        return photo
-
-    def _fetch(self, ahead: Sequence[int]) -> None:
-        if self.pool is None:
-            return
-        self.coming = {index: future for index, future in self.coming.items() if index in ahead}
-        for index in ahead:
-            if index not in self.coming:
-                self.coming[index] = self.pool.submit(self._copy, index)
-
-    def _copy(self, index: int) -> tuple[torch.Tensor, torch.cuda.Event]:
-        pinned = self.photos[index].pin_memory()
-        with torch.cuda.stream(self.stream):
-            photo = pinned.to(self.device, non_blocking=True)
-            copied = torch.cuda.Event()
-            copied.record()
-        return photo, copied
 
 
 def with_cameras(views: Sequence[View], cameras: Sequence[Camera]) -> list[View]:

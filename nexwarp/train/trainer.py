@@ -137,7 +137,7 @@ class Trainer(TrainingState):
     def _next_target(self) -> Target:
         self.iteration += 1
         index = self.targets.next_view(self.iteration)
-        return self.targets.make(index, self.iteration, self.order[:-3:-1])
+        return self.targets.make(index, self.iteration)
 
     def _run_step(self, target: Target) -> StepResult:
         graphs = self.graphs

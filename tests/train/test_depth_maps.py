@@ -32,17 +32,17 @@ def test_without_maps_the_loss_changes_no_bit(scene: nw.Scene, mapped: nw.Scene)
     assert_same_state(trained(scene, small()), plain)
     assert_same_state(trained(mapped, small(losses=OFF)), plain)
     trainer = nw.Trainer(scene, small(), "cpu")
-    assert trainer.targets.make(0, 1, []).depth is None and "depth_maps" not in trainer.step().losses
+    assert trainer.targets.make(0, 1).depth is None and "depth_maps" not in trainer.step().losses
 
 
 def test_photos_without_a_map_have_the_same_kind_of_step(mapped: nw.Scene) -> None:
     """So that one CUDA graph serves all, those with a teacher's picture too: zeros, which count nowhere."""
     trainer = nw.Trainer(mapped, small(losses=LossWeights(depth=0.0)), "cpu")
-    bare, full = (trainer.targets.make(index, 1, []) for index in (0, 1))
+    bare, full = (trainer.targets.make(index, 1) for index in (0, 1))
     assert _kind(bare) == _kind(full) and not present(bare.depth).any() and bool((present(full.depth) == 3).all())
     teacher = trained(mapped, small(seed=1)).finish()
     student = nw.Trainer(mapped, small(losses=LossWeights(depth=0.0)), "cpu", teachers=[teacher])
-    taught = student.targets.make(1, 2, [])
+    taught = student.targets.make(1, 2)
     assert _kind(taught) == _kind(full) and not present(taught.depth).any()
 
 
@@ -52,7 +52,7 @@ def test_masked_pixels_have_no_depth(mapped: nw.Scene, mode: str) -> None:
     mask = torch.rand(view.image.shape[:2]) < 0.5
     scene = dataclasses.replace(mapped, train=[dataclasses.replace(view, mask=mask), *mapped.train[2:]])
     trainer = nw.Trainer(scene, small(mask_mode=mode), "cpu")
-    depth = trainer.targets.make(0, 1, []).depth
+    depth = trainer.targets.make(0, 1).depth
     assert torch.equal(present(depth), 3.0 * mask)
 
 
