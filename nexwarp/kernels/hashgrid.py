@@ -15,84 +15,21 @@ the cell of a point is frozen. The fixed-point form adds up integers, one for ea
 units that the caller chooses: the same bits in whatever order.
 """
 
-import functools
+from __future__ import annotations
+
 import math
-from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
 
-from nexwarp.kernels.types import ints, types
+from nexwarp.kernels.types import func_per_real, ints, per_real
+from nexwarp.native.cells import merge_functions
 from nexwarp.native.fixed_point import fixed_point_units
 from nexwarp.native.vector_loads import load_function
 
 PRIME_Y = wp.constant(wp.uint32(2654435761))
 PRIME_Z = wp.constant(wp.uint32(805459861))
 INVERSE_TWO_PI = wp.constant(wp.float64(1.0 / (2.0 * math.pi)))
-
-# Atomics of two and of four floats exist from sm_90 on: as many fewer in the backward pass.
-_ADD = """
-    bool there = false;
-    for (int k = 0; k < FEATURES; ++k) there = there || value[k] != 0.0f;
-    if (!there) return;
-#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
-    atomicAdd(reinterpret_cast<floatFEATURES*>(&wp::index(table, level, slot)), make_floatFEATURES(VALUES));
-#else
-    wp::atomic_add(table, level, slot, value);
-#endif
-"""
-
-# Neighbouring pixels fall into the same cell of a coarse level: the lanes of a cell add up theirs in a tree, and only
-# the first of them goes on to the atomics. Absent lanes (a part-filled warp, empty hits) are left out by the mask.
-_MERGE = """
-#if defined(__CUDA_ARCH__)
-    const unsigned active = __activemask();
-    const unsigned long long xy = ((unsigned long long)(unsigned)y << 32) | (unsigned)x;
-    const unsigned peers = __match_any_sync(active, xy) & __match_any_sync(active, z);
-    const int lane = threadIdx.x & 31;
-    int rank = __popc(peers & ((1u << lane) - 1u));
-    const bool first = rank == 0;
-    unsigned rest = peers & (0xfffffffeu << lane);
-    while (__any_sync(active, rest != 0u)) {
-        const int next = __ffs(rest) - 1;
-        for (int j = 0; j < 8; ++j) {
-            for (int k = 0; k < FEATURES; ++k) {
-                const float other = __shfl_sync(active, value.data[j][k], next < 0 ? lane : next);
-                if (next >= 0) value.data[j][k] += other;
-            }
-        }
-        rest &= __ballot_sync(active, (rank & 1) == 0);
-        rank >>= 1;
-    }
-    if (!first) {
-        for (int j = 0; j < 8; ++j) for (int k = 0; k < FEATURES; ++k) value.data[j][k] = 0.0f;
-    }
-#endif
-    return value;
-"""
-
-
-@functools.cache
-def merge_functions(features: int) -> SimpleNamespace:
-    """Make `merge_cells` and `add_row` for tables of rows of 2 or 4 floats."""
-    row = wp.types.vector(length=features, dtype=wp.float32)
-    corners = wp.types.matrix(shape=(8, features), dtype=wp.float32)
-    values = ", ".join(f"value[{k}]" for k in range(features))
-
-    def filled(text: str) -> str:
-        return text.replace("FEATURES", str(features)).replace("VALUES", values)
-
-    @wp.func_native(filled(_MERGE))
-    def merge_cells(x: wp.int32, y: wp.int32, z: wp.int32, value: corners) -> corners:
-        """Return the sum over all lanes with the cell (x, y, z) in the first of them, zeros in the others."""
-        ...
-
-    @wp.func_native(filled(_ADD))
-    def add_row(table: wp.array2d(dtype=row), level: wp.int32, slot: wp.int32, value: row):
-        """Add to table[level, slot] atomically, unless there is nothing to add."""
-        ...
-
-    return SimpleNamespace(merge_cells=merge_cells, add_row=add_row)
 
 
 @wp.func
@@ -138,163 +75,119 @@ def interpolate_dot(fraction: Any, corners: Any, scale: Any, depth: Any, focal: 
     return wp.dot(interpolate(fraction, corners, scale, depth, focal), grad)
 
 
-@functools.cache
-def gather_function(real: type, storage: type, features: int) -> wp.Function:
-    """Make the function that reads the rows of a cell's eight corners."""
-    row = wp.types.vector(length=features, dtype=storage)
-    mat = wp.types.matrix(shape=(8, features), dtype=real)
-    load = load_function(features, storage)
+@func_per_real
+def gather(table: Any, level: int, corner: wp.vec3i, mask: wp.uint32):
+    """The rows of a cell's eight corners."""
+    corners = wp.matrix(shape=(8, features), dtype=real)
+    for j in range(8):
+        value = wp.static(load_function(features, storage))(table, level, hash_slot(corner, j, mask))
+        for k in range(wp.static(features)):
+            corners[j, k] = real(value[k])
+    return corners
 
-    @wp.func
-    def gather(table: wp.array2d(dtype=row), level: int, corner: wp.vec3i, mask: wp.uint32):
-        corners = mat()
-        for j in range(8):
-            value = load(table, level, hash_slot(corner, j, mask))
+
+@func_per_real
+def scatter(sums: Any, level: int, corner: wp.vec3i, mask: wp.uint32, grads: Any, units: Any, bad: ints):
+    """Add gradients to the rows of a cell's eight corners; in fixed point to their integers.
+
+    There the lanes of a cell do not add up theirs first: which ones come together may change.
+    """
+    total = grads
+    if wp.static(merged(real, features) and not fixed_point):
+        total = wp.static(merge_functions(features).merge_cells)(corner[0], corner[1], corner[2], grads)
+    for j in range(8):
+        slot = hash_slot(corner, j, mask)
+        if wp.static(fixed_point):
             for k in range(wp.static(features)):
-                corners[j, k] = real(value[k])
-        return corners
-
-    return gather
-
-
-@functools.cache
-def scatter_function(real: type, features: int, fixed_point: bool) -> wp.Function:
-    """Make the function that adds gradients to the rows of a cell's eight corners; in fixed point to their integers."""
-    vec = wp.types.vector(length=features, dtype=real)
-    mat = wp.types.matrix(shape=(8, features), dtype=real)
-    if fixed_point:
-        # The lanes of a cell do not add up theirs first: which ones come together may change.
-
-        @wp.func
-        def scatter(
-            sums: wp.array2d(dtype=wp.int64),
-            level: int,
-            corner: wp.vec3i,
-            mask: wp.uint32,
-            grads: mat,
-            units: wp.array(dtype=wp.float64),
-            bad: ints,
-        ):
-            for j in range(8):
-                first = int(hash_slot(corner, j, mask)) * wp.static(features)
-                for k in range(wp.static(features)):
-                    fixed_point_units(sums, level, first + k, grads[j, k], units[0], bad)
-
-        return scatter
-    merged = features in (2, 4) and real is wp.float32
-    merge = merge_functions(features) if merged else SimpleNamespace(merge_cells=None, add_row=None)
-    merge_cells, add_row = merge.merge_cells, merge.add_row
-
-    @wp.func
-    def scatter(
-        sums: wp.array2d(dtype=vec),
-        level: int,
-        corner: wp.vec3i,
-        mask: wp.uint32,
-        grads: mat,
-        units: wp.array(dtype=wp.float64),
-        bad: ints,
-    ):
-        total = grads
-        if wp.static(merged):
-            total = merge_cells(corner[0], corner[1], corner[2], grads)
-        for j in range(8):
-            part = vec()
+                fixed_point_units(sums, level, int(slot) * wp.static(features) + k, grads[j, k], units[0], bad)
+        else:
+            part = wp.vector(length=features, dtype=real)
             for k in range(wp.static(features)):
                 part[k] = total[j, k]
-            if wp.static(merged):
-                add_row(sums, level, hash_slot(corner, j, mask), part)
+            if wp.static(merged(real, features)):
+                wp.static(merge_functions(features).add_row)(sums, level, slot, part)
             else:
-                wp.atomic_add(sums, level, hash_slot(corner, j, mask), part)
-
-    return scatter
+                wp.atomic_add(sums, level, slot, part)
 
 
-@functools.cache
-def hashgrid_kernels(real: type, storage: type, features: int, fixed_point: bool = False) -> SimpleNamespace:
-    """Make the forward and backward kernels, for 1, 2, 4 or 8 features a level.
+def rows_of(length: int, dtype: type) -> Any:
+    """Return the type of arrays of two dimensions whose entries are vectors."""
+    return wp.array2d(dtype=wp.types.vector(length=length, dtype=dtype))
 
-    Positions, table gradients and arithmetic are of the type `real`, the table and the features written of `storage`,
-    `real` or wp.float16. With `fixed_point` the backward kernel adds to the table integers, `units` of them in 1.
-    """
-    t = types(real)
-    vec4 = t.vec4
-    row = wp.types.vector(length=features, dtype=storage)
-    vec = wp.types.vector(length=features, dtype=real)
-    reals, vec3s, vec4_rows, ZERO = t.reals, t.vec3s, t.vec4_rows, t.ZERO
-    gather = gather_function(real, storage, features)
-    scatter = scatter_function(real, features, fixed_point)
-    options = {"fast_math": real is wp.float32}
-    table_of_sums = wp.array2d(dtype=wp.int64) if fixed_point else wp.array2d(dtype=vec)
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
-    def hashgrid(
-        first: int,
-        table: wp.array2d(dtype=row),
-        positions: vec3s,
-        depths: reals,
-        resolutions: reals,
-        focal: reals,
-        mask: wp.uint32,
-        # outputs
-        encoded: wp.array2d(dtype=storage),
-    ):
-        l_, p = wp.tid()
-        level = first + l_
-        value = vec()
-        depth = depths[p]
-        if depth > ZERO:
-            scale = resolutions[level]
-            x = positions[p] * scale
-            base = floor_of(x)
-            corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
-            x -= base
-            value = interpolate(x, gather(table, level, corner, mask), scale, depth, focal[0])
-        for k in range(wp.static(features)):
-            encoded[level * features + k, p] = storage(value[k])
+def merged(real: type, features: int) -> bool:
+    """Whether `merge_functions` has functions for rows of these."""
+    return features in (2, 4) and real is wp.float32
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
-    def hashgrid_backward(  # noqa: PLR0913  # a kernel entry point
-        first: int,
-        table: wp.array2d(dtype=row),
-        positions: vec3s,
-        depths: reals,
-        resolutions: reals,
-        focal: reals,
-        mask: wp.uint32,
-        grad_encoded: wp.array2d(dtype=storage),
-        unscale: reals,
-        units: wp.array(dtype=wp.float64),
-        levels_per_thread: int,
-        # outputs
-        grad_table: table_of_sums,
-        grad_points: vec4_rows,
-        bad: ints,
-    ):
-        r_, p = wp.tid()
-        run = first + r_
-        depth = depths[p]
-        if not (depth > ZERO):
-            if grad_points.shape[0] > 0:
-                grad_points[run, p] = vec4()
-            return
-        total = vec4()
-        start = run * levels_per_thread
-        for level in range(start, wp.min(start + levels_per_thread, resolutions.shape[0])):
-            grad = vec()
-            for k in range(wp.static(features)):
-                grad[k] = real(grad_encoded[level * features + k, p]) * unscale[0]
-            scale = resolutions[level]
-            x = positions[p] * scale
-            base = floor_of(x)
-            corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
-            x -= base
-            gx, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
-                x, gather(table, level, corner, mask), scale, depth, focal[0], grad
-            )
-            scatter(grad_table, level, corner, mask, gc, units, bad)
-            total += vec4(gx[0] * scale, gx[1] * scale, gx[2] * scale, gd)
+
+@per_real("storage", "features", fast_math=True)
+def hashgrid(
+    first: int,
+    table: rows_of(features, storage),
+    positions: vec3s,
+    depths: reals,
+    resolutions: reals,
+    focal: reals,
+    mask: wp.uint32,
+    # outputs
+    encoded: wp.array2d(dtype=storage),
+):
+    l_, p = wp.tid()
+    level = first + l_
+    value = wp.vector(length=features, dtype=real)
+    depth = depths[p]
+    if depth > ZERO:
+        scale = resolutions[level]
+        x = positions[p] * scale
+        base = floor_of(x)
+        corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
+        x -= base
+        value = interpolate(x, gather(table, level, corner, mask), scale, depth, focal[0])
+    for k in range(wp.static(features)):
+        encoded[level * features + k, p] = storage(value[k])
+
+
+@per_real("storage", "features", "fixed_point", fast_math=True)
+def hashgrid_backward(  # noqa: PLR0913  # a kernel entry point
+    first: int,
+    table: rows_of(features, storage),
+    positions: vec3s,
+    depths: reals,
+    resolutions: reals,
+    focal: reals,
+    mask: wp.uint32,
+    grad_encoded: wp.array2d(dtype=storage),
+    unscale: reals,
+    units: wp.array(dtype=wp.float64),
+    levels_per_thread: int,
+    # outputs
+    grad_table: wp.array2d(dtype=wp.int64) if fixed_point else rows_of(features, real),
+    grad_points: vec4_rows,
+    bad: ints,
+):
+    """With `fixed_point` integers are added to the table, `units` of them in 1."""
+    r_, p = wp.tid()
+    run = first + r_
+    depth = depths[p]
+    if not (depth > ZERO):
         if grad_points.shape[0] > 0:
-            grad_points[run, p] = total
-
-    return SimpleNamespace(forward=hashgrid, backward=hashgrid_backward)
+            grad_points[run, p] = vec4()
+        return
+    total = vec4()
+    start = run * levels_per_thread
+    for level in range(start, wp.min(start + levels_per_thread, resolutions.shape[0])):
+        grad = wp.vector(length=features, dtype=real)
+        for k in range(wp.static(features)):
+            grad[k] = real(grad_encoded[level * features + k, p]) * unscale[0]
+        scale = resolutions[level]
+        x = positions[p] * scale
+        base = floor_of(x)
+        corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
+        x -= base
+        gx, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
+            x, gather(table, level, corner, mask), scale, depth, focal[0], grad
+        )
+        scatter(grad_table, level, corner, mask, gc, units, bad)
+        total += vec4(gx[0] * scale, gx[1] * scale, gx[2] * scale, gd)
+    if grad_points.shape[0] > 0:
+        grad_points[run, p] = total

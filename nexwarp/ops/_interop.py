@@ -126,9 +126,10 @@ def array(tensor: torch.Tensor | None, dtype: type) -> Argument:
 
 
 Kernel: TypeAlias = wp.Kernel | PerReal
+Names: TypeAlias = dict[str, Any]  # that a kernel depends on, see `PerReal`
 
 # What a kernel or a struct declares: an array's elements, and the dimensions of a tensor that holds it; or a struct.
-Declared: TypeAlias = Any
+Declared: TypeAlias = WarpObject
 
 
 def _declared(kind: WarpObject) -> Declared:
@@ -272,7 +273,7 @@ def launch(
     *,
     block_dim: int = 256,
     sharing: launching.Sharing = launching.LIGHT,
-    **names: Any,
+    **names: Argument,
 ) -> None:
     """Launch on the device and current stream of `like`; see `nexwarp.kernels.launch.launch`.
 

@@ -1,7 +1,7 @@
 """Collection pass (paper Sec. 4.2): each pixel's K heaviest hits, their plain colour, and that of all other hits."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -125,7 +125,7 @@ class Walked(NamedTuple):
         view = (camera.K.contiguous(), wp.vec2i(camera.width, camera.height), tiles.columns, camera.near)
         return [(self.records, self.limits, tiles.reaches, self.channels), lists, view]
 
-    def launch(self, kernel: Kernel, arguments: list[Argument], **names: Any) -> None:
+    def launch(self, kernel: Kernel, arguments: list[Argument], **names: Argument) -> None:
         """Launch a kernel over the pixels of all tiles, with these arguments behind those of `arguments`."""
         pixels = tile_size_on(self.records.is_cuda) ** 2  # of a tile
         threads = pixels * (len(self.tiles.tile_offsets) - 1)

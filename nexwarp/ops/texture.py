@@ -4,21 +4,20 @@ Encode, MLP, colours: three steps in torch and Warp. `fused_texture` does all th
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 import warp as wp
 
-from nexwarp.kernels.hashgrid import hashgrid_kernels
+from nexwarp.kernels.hashgrid import hashgrid, hashgrid_backward
 from nexwarp.kernels.sh import textured_colors, textured_colors_backward
 from nexwarp.ops import fused_texture, mlp
 from nexwarp.ops._interop import (
     STORAGES,
     Argument,
     Context,
+    Names,
     first_derivative,
     launch,
-    real_of,
     sums_in_fixed_point,
 )
 from nexwarp.ops.neural_field import Field, Points, Rays, gradient_scale
@@ -135,7 +134,7 @@ class Lookup:
         encoded = self.table.new_empty(levels * features, mlp.padded(count, self.table.dtype))
         # Without biases the padding stays 0 through all layers, and adds nothing to any gradient.
         encoded[:, count:] = 0
-        launch(self.table, self._kernels(False).forward, (levels, count), self._arguments(), [encoded])
+        launch(self.points.positions, hashgrid, (levels, count), self._arguments(), [encoded], **self._names())
         return encoded
 
     def backward(
@@ -155,14 +154,15 @@ class Lookup:
         sums = torch.zeros_like(self.table, dtype=torch.int64 if fixed_point else self.points.positions.dtype)
         inputs = [*self._arguments(), grad_encoded, unscale, units, levels_per_thread]
         outputs = [sums.flatten(1) if fixed_point else sums, grad_points, bad]
-        launch(self.table, self._kernels(fixed_point).backward, (runs, count), inputs, outputs)
+        names = self._names() | {"fixed_point": fixed_point}
+        launch(self.points.positions, hashgrid_backward, (runs, count), inputs, outputs, **names)
         if units is not None and bad is not None:
             sums = torch.where(bad.bool(), torch.nan, (sums.double() / units).to(grad_points.dtype))
         return sums, grad_points.sum(0) if runs > 1 else grad_points.view(-1, 4)
 
-    def _kernels(self, fixed_point: bool) -> Any:
-        real, storage = real_of(self.points.positions), STORAGES[self.table.dtype]
-        return hashgrid_kernels(real, storage, self.table.shape[2], fixed_point)
+    def _names(self) -> Names:
+        """What the kernels depend on."""
+        return {"storage": STORAGES[self.table.dtype], "features": self.table.shape[2]}
 
     def _arguments(self) -> list[Argument]:
         points, mask = self.points, wp.uint32(self.table.shape[1] - 1)
@@ -177,7 +177,7 @@ def _units(grad_encoded: torch.Tensor, unscale: torch.Tensor) -> torch.Tensor:
     return torch.exp2(torch.floor(torch.log2(2.0**46 / largest.clamp_min(1e-200)))).view(1)
 
 
-def _color_arguments(coefficients: torch.Tensor, rays: Rays, count: int) -> tuple[list[Argument], dict[str, Any]]:
+def _color_arguments(coefficients: torch.Tensor, rays: Rays, count: int) -> tuple[list[Argument], Names]:
     """The arguments that the kernels of colours along rays begin with, and the names that they depend on."""
     if len(coefficients) not in OUTPUTS:
         raise ValueError(f"weights: expected 3 (d + 1)^2 outputs with d of 0 to 3, got {len(coefficients)}")
