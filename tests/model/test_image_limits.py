@@ -125,7 +125,7 @@ def test_an_allocation_that_fails_is_our_error(monkeypatch, device):
     def fail(*arguments: Any) -> Any:
         raise RuntimeError("Failed to allocate 3221225472 bytes on device 'cuda:0'")
 
-    monkeypatch.setattr(tiles, "_tile_polygons", fail)
+    monkeypatch.setattr(tiles, "_depth_order", fail)
     line = f"^out of memory: an image of 23x18 .* needs 3.00 GiB; {SMALLER}$"
     with pytest.raises(OutOfMemoryError, match=line) as told:
         model.render(camera)
@@ -140,11 +140,11 @@ def test_what_an_error_leaves_is_freed_without_the_garbage_collector(monkeypatch
     surfels, texture, camera = parts()
     kept: list[weakref.ref[torch.Tensor]] = []
 
-    def fail(shape: list[torch.Tensor], *_: Any) -> None:
-        kept.append(weakref.ref(shape[2]))
+    def fail(centers: torch.Tensor, _: str) -> None:
+        kept.append(weakref.ref(centers))
         raise type(error)(*error.args)
 
-    monkeypatch.setattr(tiles, "_tile_polygons", fail)
+    monkeypatch.setattr(tiles, "_depth_order", fail)
     plain = {name: x.detach() for name, x in surfels.activated()._asdict().items()}
     colors = torch.zeros(len(surfels), 3)
     gc.disable()
