@@ -202,10 +202,10 @@ def fit_exposures(seen: Observations, cameras: Sequence[Camera], *, vignetting: 
     largest = max(min(FURTHER * float(seen.squares.max()), max(map(_corner, cameras))), 10.0**-DECIMALS)
     fit = Fit(np.zeros((len(cameras), 3)), np.zeros(2), round(largest, DECIMALS))
     powers, values = fit.powers(seen), np.ones(seen.color.shape)
-    solver = GainSolver(seen, len(cameras))
     for _ in range(ROUNDS):
         weights = Weights(seen.point, values)
-        fit = fit._replace(gains=solver.gains(seen.color - fit.lens @ powers, weights).T)
+        gains = solve_gains(seen, len(cameras), seen.color - fit.lens @ powers, weights)
+        fit = fit._replace(gains=gains.T)
         if vignetting:
             fit = fit._replace(lens=_solve_lens(powers, seen.color - fit.gains.T.take(seen.view, axis=1), weights))
         values = _robust(weights.apart(fit.unexposed(seen)))
@@ -218,39 +218,31 @@ def _corner(camera: Camera) -> float:
     return x**2 + y**2
 
 
-class GainSolver:
-    """Solves for the log gains of V photos by least squares of log colours."""
+def solve_gains(seen: Observations, photos: int, observed: np.ndarray, weights: Weights) -> np.ndarray:
+    """Return the log gains (C, V), mean 0 in each channel, of V photos by least squares of log colours (C, M)."""
+    # The points' own colours, eliminated, leave a Laplacian of the photos.
+    right = weights.values * weights.apart(observed)
+    channels = zip(weights.values, weights.totals, right, strict=True)
+    gains = np.stack(list(in_threads(lambda channel: _channel_gains(seen, photos, *channel), channels)))
+    return gains - gains.mean(axis=1, keepdims=True)
 
-    def __init__(self, seen: Observations, photos: int) -> None:
-        self.view, self.point, self.photos = seen.view, seen.point, photos
-        self.order = np.argsort(seen.view, kind="stable")
-        self.first_of_point, self.first_of_photo = (
-            np.concatenate([[0], np.cumsum(np.bincount(index, minlength=count))])
-            for index, count in ((seen.point, len(seen.places)), (seen.view, photos))
-        )
 
-    def gains(self, observed: np.ndarray, weights: Weights) -> np.ndarray:
-        """Return the log gains (C, V), mean 0 in each channel, for log colours (C, M)."""
-        # The points' own colours, eliminated, leave a Laplacian of the photos.
-        right = weights.values * weights.apart(observed)
-        channels = zip(weights.values, weights.totals, right, strict=True)
-        gains = np.stack(list(in_threads(lambda channel: self._channel(*channel), channels)))
-        return gains - gains.mean(axis=1, keepdims=True)
+def _channel_gains(
+    seen: Observations, photos: int, weights: np.ndarray, totals: np.ndarray, right: np.ndarray
+) -> np.ndarray:
+    from scipy.sparse import csc_array, csr_array, diags_array
+    from scipy.sparse.linalg import spsolve
 
-    def _channel(self, weights: np.ndarray, totals: np.ndarray, right: np.ndarray) -> np.ndarray:
-        from scipy.sparse import csc_array, csr_array, diags_array
-        from scipy.sparse.linalg import spsolve
-
-        shares = weights / np.sqrt(totals).take(self.point)
-        by_point = csr_array((shares, self.view, self.first_of_point), (len(self.first_of_point) - 1, self.photos))
-        by_photo = csr_array((shares[self.order], self.point[self.order], self.first_of_photo), by_point.shape[::-1])
-        shared = by_photo @ by_point
-        diagonal = np.bincount(self.view, weights, self.photos) + PRIOR
-        right = np.bincount(self.view, right, self.photos)
-        if self.photos > MOST_DENSE:
-            return spsolve(csc_array(diags_array(diagonal) - shared), right)
-        factor = torch.linalg.cholesky(torch.from_numpy(np.diag(diagonal) - shared.toarray()))
-        return torch.cholesky_solve(torch.from_numpy(right)[:, None], factor)[:, 0].numpy()
+    shares = weights / np.sqrt(totals).take(seen.point)
+    first = np.searchsorted(seen.point, np.arange(len(seen.places) + 1))  # of each point's observations
+    by_point = csr_array((shares, seen.view, first), (len(seen.places), photos))
+    shared = by_point.T.tocsr() @ by_point
+    diagonal = np.bincount(seen.view, weights, photos) + PRIOR
+    right = np.bincount(seen.view, right, photos)
+    if photos > MOST_DENSE:
+        return spsolve(csc_array(diags_array(diagonal) - shared), right)
+    factor = torch.linalg.cholesky(torch.from_numpy(np.diag(diagonal) - shared.toarray()))
+    return torch.cholesky_solve(torch.from_numpy(right)[:, None], factor)[:, 0].numpy()
 
 
 def _solve_lens(powers: np.ndarray, observed: np.ndarray, weights: Weights) -> np.ndarray:

@@ -178,8 +178,8 @@ def test_gains_are_the_least_squares_of_photos_and_points_together(monkeypatch, 
     together = np.concatenate([root[:, None] * design, prior]), np.concatenate([root * observed, np.zeros(photos)])
     expected = np.linalg.lstsq(*together, rcond=None)[0][:photos]
     seen = Observations(view, point, observed[None], np.zeros(count), np.zeros((points, 3)))
-    solver = exposure_calibration.GainSolver(seen, photos)
-    gains = solver.gains(observed[None], exposure_calibration.Weights(point, weights[None]))[0]
+    weighted = exposure_calibration.Weights(point, weights[None])
+    gains = exposure_calibration.solve_gains(seen, photos, observed[None], weighted)[0]
     np.testing.assert_allclose(gains, expected - expected.mean(), rtol=0, atol=1e-10)
 
 
