@@ -29,25 +29,12 @@ TINY_WEIGHT = 1e-3  # hits below it keep their plain colours
 SIDE = 4096  # texels of the atlas along an axis at most
 MAX_SIDE = 256  # texels of one surfel along one axis
 FILLED = 0.85  # fraction of the atlas that rectangles cover at most: packing leaves gaps
-BISECTIONS = 24
 TEXELS_AT_A_TIME = 2**20
 LARGEST_TEXEL = 1e6  # pixels
 UNCLIPPED = 0.98  # of the colours that 8 bits are to hold
-GROWTH = 1.2
+GROWTH = 1.05  # of texels, until all rectangles fit
 
 Progress = Callable[[str, int, int], None]  # name of a stage, how much of it is done, and of how much
-
-
-@dataclass(frozen=True)
-class ViewHits:
-    """The heaviest hits of each pixel of one view, at most 8 a pixel; P hits in all."""
-
-    slots: torch.Tensor  # (P,) int64, places in (H, W, 8) buffers; the first of a pixel has the largest weight
-    ids: torch.Tensor  # (P,) int64, surfels
-    weights: torch.Tensor  # (P,) blending weights
-    depths: torch.Tensor  # (P,) z-depths, world units
-    local: torch.Tensor  # (P, 2) coordinates of the hits on their surfels, in units of the scales
-    directions: torch.Tensor  # (P, 3) unit directions of the rays, world frame
 
 
 @dataclass(frozen=True)
@@ -186,25 +173,6 @@ def untextured(model: Model, surfels: Surfels | None = None) -> Model:
 
 
 @torch.no_grad()
-def hits_of(bare: Model, camera: Camera) -> ViewHits:
-    """Render a view of an `untextured` model and locate its hits on their surfels."""
-    camera = camera.to(bare.device)
-    rendering = bare.render(camera)
-    surfels = bare.surfels
-    slots = (rendering.weights >= TINY_WEIGHT).flatten().nonzero()[:, 0]
-    pixels = slots // MAX_HITS
-    ids, weights, depths = (x.flatten()[slots] for x in (rendering.ids, rendering.weights, rendering.depths))
-    ids = ids.long()
-    x = (pixels % camera.width + 0.5 - camera.cx) / camera.fx
-    y = (pixels // camera.width + 0.5 - camera.cy) / camera.fy
-    rays = torch.stack([x, y, torch.ones_like(weights)], dim=1) @ camera.viewmat[:3, :3].to(weights)
-    offsets = camera.position.to(weights) + depths[:, None] * rays - surfels.means.detach()[ids]
-    coordinates = [(offsets * axis[ids]).sum(1) for axis in axes(surfels)]
-    local = torch.stack(coordinates, dim=1) / surfels.scales.detach()[ids]
-    return ViewHits(slots, ids, weights, depths, local, normalize(rays, dim=1))
-
-
-@torch.no_grad()
 def observe(
     model: Model, cameras: Sequence[Camera], progress: Callable[[int, int], object] = lambda *_: None
 ) -> Observations:
@@ -215,20 +183,30 @@ def observe(
     pixels, total, textured = means.new_zeros(count, 2), means.new_zeros(count), means.new_zeros(count)
     directions, scales, sides = means.new_zeros(count, 3), model.surfels.scales.detach(), axes(model.surfels)
     for done, camera in enumerate(cameras, 1):
-        hits = hits_of(bare, camera)
-        total.index_add_(0, hits.ids, hits.weights)
-        directions.index_add_(0, hits.ids, hits.weights[:, None] * hits.directions)
-        heavy = hits.slots % MAX_HITS < kept
-        textured.index_add_(0, hits.ids, hits.weights * heavy)
-        heavy &= hits.weights >= LEAST_WEIGHT
-        ids, local, rays = hits.ids[heavy], hits.local[heavy], hits.directions[heavy]
-        pairs = ids[:, None].expand(-1, 2)
+        camera = camera.to(bare.device)
+        out = bare.render(camera)
+        slots = (out.weights >= TINY_WEIGHT).flatten().nonzero()[:, 0]  # of the hits; a pixel's first is the heaviest
+        ids, weights, depths = (x.flatten()[slots] for x in (out.ids.long(), out.weights, out.depths))
+        places, sides_of = slots // MAX_HITS, [axis[ids] for axis in sides]
+        x = (places % camera.width + 0.5 - camera.cx) / camera.fx
+        y = (places // camera.width + 0.5 - camera.cy) / camera.fy
+        rays = torch.stack([x, y, torch.ones_like(weights)], dim=1) @ camera.viewmat[:3, :3].to(weights)
+        offsets = camera.position.to(weights) + depths[:, None] * rays - means[ids]
+        # Coordinates on the surfels, in units of the scales.
+        local = torch.stack([(offsets * axis).sum(1) for axis in sides_of], dim=1) / scales[ids]
+        rays = normalize(rays, dim=1)
+        total.index_add_(0, ids, weights)
+        directions.index_add_(0, ids, weights[:, None] * rays)
+        heavy = slots % MAX_HITS < kept
+        textured.index_add_(0, ids, weights * heavy)
+        heavy &= weights >= LEAST_WEIGHT
+        pairs = ids[heavy, None].expand(-1, 2)
         for side, how in ((0, "amin"), (2, "amax")):
-            boxes[:, side : side + 2].scatter_reduce_(0, pairs, local, how)
+            boxes[:, side : side + 2].scatter_reduce_(0, pairs, local[heavy], how)
         # Pixels that one scale covers: its part across the ray, over the size of a pixel at the hit.
-        cosines = torch.stack([(axis[ids] * rays).sum(1) for axis in sides], dim=1)
-        sizes = hits.depths[heavy] / camera.focal
-        covered = scales[ids] * (1 - cosines.square()).clamp_min(0).sqrt() / sizes[:, None]
+        cosines = torch.stack([(axis * rays).sum(1) for axis in sides_of], dim=1)[heavy]
+        sizes = depths[heavy] / camera.focal
+        covered = scales[ids[heavy]] * (1 - cosines.square()).clamp_min(0).sqrt() / sizes[:, None]
         pixels.scatter_reduce_(0, pairs, covered, "amax")
         progress(done, len(cameras))
     return Observations(boxes, pixels, textured / total.clamp_min(1e-12), normalize(directions, dim=-1))
@@ -243,31 +221,19 @@ def lay_out(boxes: torch.Tensor, pixels: torch.Tensor, *, fewest: int = 2) -> La
     textured = boxes[:, 2] > boxes[:, 0]
     boxes = boxes.where(textured[:, None], 0.0)
     covered = ((boxes[:, 2:] - boxes[:, :2]) * pixels)[textured].double().cpu()
-    room = FILLED * SIDE * SIDE
-    fewest = max(min(fewest, int(math.sqrt(room / max(len(covered), 1)))), 2)
-
-    def sizes_at(step: float) -> tuple[torch.Tensor, int]:
-        sizes = ((covered / step).ceil() + 1).clamp(fewest, MAX_SIDE).int()
-        return sizes, int(sizes.long().prod(1).sum())
-
-    low = high = 1.0  # pixels a texel
-    while sizes_at(high)[1] > room and high < LARGEST_TEXEL:
-        high *= 2
-    for _ in range(BISECTIONS if high > low else 0):
-        middle = math.sqrt(low * high)
-        if sizes_at(middle)[1] > room:
-            low = middle
-        else:
-            high = middle
+    fewest = max(min(fewest, int(math.sqrt(FILLED * SIDE * SIDE / max(len(covered), 1)))), 2)
+    texel = 1.0  # pixels
     while True:
-        sizes, area = sizes_at(high)
-        width = min(SIDE, max(64, 2 ** math.ceil(math.log2(math.sqrt(max(area, 1) / FILLED)))))
-        places, height = _pack(sizes, width)
-        if height <= SIDE and (not len(sizes) or int(sizes[:, 0].max()) <= width):
-            break
-        if high > LARGEST_TEXEL:
+        sizes = ((covered / texel).ceil() + 1).clamp(fewest, MAX_SIDE).int()
+        area = int(sizes.long().prod(1).sum())
+        if area <= SIDE * SIDE:
+            width = min(SIDE, max(64, 2 ** math.ceil(math.log2(math.sqrt(max(area, 1) / FILLED)))))
+            places, height = _pack(sizes, width)
+            if height <= SIDE and (not len(sizes) or int(sizes[:, 0].max()) <= width):
+                break
+        if texel > LARGEST_TEXEL:
             raise FormatError(f"surfels: expected fewer for an atlas of {SIDE}x{SIDE} texels, got {len(sizes):,}")
-        high *= GROWTH  # the shelves leave more gaps than FILLED allows for
+        texel *= GROWTH
     rects = torch.tensor([0, 0, 1, 1], dtype=torch.int32).repeat(len(boxes), 1)
     rects[textured.cpu()] = torch.cat([places, sizes], dim=1)
     return Layout(rects.to(boxes.device), boxes, width, height)

@@ -22,7 +22,7 @@ from nexwarp.kernels.sh import BAND_0
 from nexwarp.model.surfels import Surfels
 
 if TYPE_CHECKING:
-    from pxr import Usd, UsdGeom, Vt
+    from pxr import Usd, UsdGeom
 
 ROOT, VARIANTS = "/Scene", "shown"
 
@@ -133,18 +133,19 @@ def _mesh(stage: "Usd.Stage", name: str, points: np.ndarray, faces: np.ndarray) 
     from pxr import UsdGeom, Vt
 
     mesh = UsdGeom.Mesh.Define(stage, f"{ROOT}/{name}")
-    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
+    vertices = Vt.Vec3fArray.FromNumpy(points.astype(np.float32))
+    mesh.CreatePointsAttr(vertices)
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), faces.shape[1], np.int32)))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateDoubleSidedAttr(True)
-    mesh.CreateExtentAttr(_extent(points))
+    mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(vertices))
     return mesh
 
 
 def _particles(stage: "Usd.Stage", surfels: Surfels, sh_degree: int, exposure: float) -> "UsdGeom.Gprim":
     """Define the particle field of the surfels, dimmed as the cards are."""
-    from pxr import UsdVol, Vt
+    from pxr import UsdGeom, UsdVol, Vt
 
     found = gaussians(surfels, sh_degree, (), float("inf"))  # surflets are exact at any size
     means, quats, scales, sh = (
@@ -168,12 +169,6 @@ def _particles(stage: "Usd.Stage", surfels: Surfels, sh_degree: int, exposure: f
     coefficients = np.ascontiguousarray(sh.reshape(-1, 3))
     radiance.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(coefficients))
     reach = 3 * scales.max(axis=1, keepdims=True)  # where the support ends
-    field.CreateExtentAttr(_extent(np.concatenate([means - reach, means + reach])))
+    ends = Vt.Vec3fArray.FromNumpy(np.concatenate([means - reach, means + reach]))
+    field.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(ends))
     return field
-
-
-def _extent(points: np.ndarray) -> "Vt.Vec3fArray":
-    """Return the corners of the box around points (N, 3)."""
-    from pxr import Gf, Vt
-
-    return Vt.Vec3fArray([Gf.Vec3f(*map(float, corner)) for corner in (points.min(0), points.max(0))])
