@@ -12,9 +12,8 @@ l, divided by that of degree 3. The colours in the training views change little;
 """
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TypeVar
 
 import torch
 
@@ -33,7 +32,6 @@ PRODUCTS = 2**26  # values of the normal equations held at once, float64: 0.5 Gi
 SOLVED = 2**21  # values of the matrices solved at once, several times
 LEAST = 1e-6  # least sum of weights over all views, in pixels, of a surfel that is seen
 FinishObserver = Callable[[str, int, int], None]
-Item = TypeVar("Item")
 
 
 def finish_model(
@@ -58,23 +56,17 @@ def finish_model(
             sh0, shN = smooth_sh(finished, seen_from, config.smooth_sh, partial(observe, "smoothing SH"))
         finished.surfels.sh0.data, finished.surfels.shN.data = sh0, shN
     if config.footprints:
-        seen = counted(cameras, "measuring detail limits", observe)
-        finished.detail_limits = measure_detail_limits(finished, seen)
+        finished.detail_limits = measure_detail_limits(finished, cameras, partial(observe, "measuring detail limits"))
     if exposures is not None:
         finished.exposures = copy.deepcopy(exposures).to(model.device)
     finished.meta = model.meta | {"smooth_sh": config.smooth_sh}
     return finished
 
 
-def counted(items: Sequence[Item], stage: str, observe: FinishObserver) -> Iterator[Item]:
-    """Yield items, each of which is done when the next one is asked for."""
-    for done, item in enumerate(items, 1):
-        yield item
-        observe(stage, done, len(items))
-
-
 @torch.no_grad()
-def measure_detail_limits(model: Model, cameras: Iterable[Camera]) -> DetailLimits:
+def measure_detail_limits(
+    model: Model, cameras: Sequence[Camera], progress: Callable[[int, int], object] = lambda *_: None
+) -> DetailLimits:
     """Return the detail limits of a model's surfels: the pixel sizes (depth / focal) at which cameras saw them."""
     bare = model.bare(max_hits=max(model.options.max_hits, 1))
     surfels = bare.surfels
@@ -82,7 +74,7 @@ def measure_detail_limits(model: Model, cameras: Iterable[Camera]) -> DetailLimi
     if not len(surfels):
         return DetailLimits(nearest, nearest.clone())
     farthest, front = torch.zeros_like(nearest), torch.zeros_like(nearest)
-    for camera in cameras:
+    for done, camera in enumerate(cameras, 1):
         camera = camera.to(surfels.device)
         out = bare.render(camera)
         seen, ids = out.weights >= ALPHA_MIN, out.ids.clamp_min(0).long()
@@ -92,6 +84,7 @@ def measure_detail_limits(model: Model, cameras: Iterable[Camera]) -> DetailLimi
         far = (torch.maximum(out.depths, centres[ids]) / camera.focal).where(seen, 0.0)
         nearest.scatter_reduce_(0, ids.flatten(), near.flatten(), "amin")
         farthest.scatter_reduce_(0, ids.flatten(), far.flatten(), "amax")
+        progress(done, len(cameras))
     # Surfels without a visible texture have the limit of their centres in the views that they are in front of.
     farthest = farthest.where(farthest > 0, front)
     return DetailLimits(nearest, farthest.where(farthest > 0, NEVER))

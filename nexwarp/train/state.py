@@ -4,15 +4,12 @@ import dataclasses
 import hashlib
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, cast
 
 import torch
 
 from nexwarp.data import Scene
-from nexwarp.errors import CheckpointError, check_finite
-from nexwarp.io.files import one_line
+from nexwarp.errors import check_finite
 from nexwarp.io.json_files import Json
 from nexwarp.model.bounds import check_bounds
 from nexwarp.model.model import Model
@@ -195,16 +192,6 @@ def _load_texture(texture: Texture, state: dict[str, torch.Tensor]) -> None:
         new = torch.empty_like(state[name], device=old.device)
         setattr(owner, leaf, torch.nn.Parameter(new) if isinstance(old, torch.nn.Parameter) else new)
     texture.load_state_dict(state)
-
-
-@contextmanager
-def checkpoint_errors(run: Path | str) -> Iterator[None]:
-    """Turn whatever a snapshot that does not fit raises into one CheckpointError."""
-    try:
-        yield
-    except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
-        reason = one_line(f"it has no {error}" if isinstance(error, KeyError) else str(error))  # torch's are long
-        raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
 
 
 def check_origin(origin: Mapping[str, str], config: Config, state: Mapping[str, Any], *, extend: bool = False) -> None:

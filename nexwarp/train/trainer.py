@@ -11,7 +11,8 @@ from typing_extensions import Unpack
 
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.data import Scene
-from nexwarp.errors import OutOfMemoryError, SceneError
+from nexwarp.errors import CheckpointError, OutOfMemoryError, SceneError
+from nexwarp.io.files import one_line
 from nexwarp.machine import deterministic, needed_memory, seed_everything, torch_threads
 from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, graph_key, updating
 from nexwarp.model.model import Model
@@ -24,7 +25,7 @@ from nexwarp.train.losses import OwnLoss, as_taken, check_own_losses, step_losse
 from nexwarp.train.optimizer import set_rates
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport, check_health, oom_message
-from nexwarp.train.state import TrainingState, check_origin, check_snapshot, checkpoint_errors, scene_digest
+from nexwarp.train.state import TrainingState, check_origin, check_snapshot, scene_digest
 from nexwarp.train.target import Target, TargetSource, TaughtTargets, check_teachers, refined, teachers_digest
 
 CHECK_EVERY = 100  # iterations between checks that all numbers are finite
@@ -247,10 +248,13 @@ class Trainer(TrainingState):
             CheckpointError: they are damaged, or scene, settings or teachers differ.
         """
         snapshot = self._read(Path(run), warn)
-        with checkpoint_errors(run):
+        try:
             check_origin(self.origin, self.config, snapshot.state, extend=extend)
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)
+        except (LookupError, TypeError, AttributeError, OverflowError, ValueError, RuntimeError) as error:
+            reason = one_line(f"it has no {error}" if isinstance(error, KeyError) else str(error))  # torch's are long
+            raise CheckpointError(f"{run}: expected a checkpoint of this run, but it does not fit ({reason})") from None
 
     def snapshot(self) -> Snapshot:
         """Return everything that shapes the future of the run, as copies on the CPU, and where it comes from."""
