@@ -12,12 +12,12 @@ import pytest
 import torch
 
 import nexwarp as nw
+from docs.generate import DOCS
 from examples import read_model
 from nexwarp.cameras.cameras_file import load_cameras
 from nexwarp.cli import main as cli
 from nexwarp.train.recipe import setting_names
 from tests.cli.support import FLAGS, read
-from tests.docs.test_docs import DOCS, ROOT
 from tests.scene_writers import expose_photos, write_demo
 
 
@@ -156,7 +156,7 @@ def execute(run, tmp_path, monkeypatch) -> Callable[[str], list[dict[str, Any]]]
 
     def executed(page: str) -> list[dict[str, Any]]:
         examples: list[dict[str, Any]] = []
-        for text in re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), re.S):
+        for text in re.findall(r"```python\n(.*?)```", (DOCS.parent / page).read_text(encoding="utf-8"), re.S):
             examples.append({"lines": len([line for line in text.splitlines() if line])})
             exec(text, examples[-1])
         return examples
