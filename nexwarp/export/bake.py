@@ -18,7 +18,7 @@ from nexwarp.export.baked_scene import BakedScene
 from nexwarp.export.fit import Views, cameras_of, fit
 from nexwarp.kernels.types import MAX_HITS
 from nexwarp.model.model import Model
-from nexwarp.model.surfels import END, Activated, Surfels
+from nexwarp.model.surfels import END, Activated, Surfels, axes
 from nexwarp.model.texture import NeuralTexture
 
 # Hits below this blending weight do not decide where a surfel has a texture: of 255 grey levels they change 4 at most.
@@ -141,17 +141,9 @@ def measure(model: Model, views: Views, progress: Progress = lambda *_: None) ->
     return evaluate(model, seen, lay_out(seen.boxes, seen.pixels))
 
 
-def axes(surfels: Surfels | Activated) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the surfels' unit x and y axes, (N, 3) each, world frame."""
-    w, x, y, z = surfels.quats.detach().unbind(-1)
-    across = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
-    along = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1)
-    return across, along
-
-
 def points_on(surfels: Surfels | Activated, ids: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
     """Return points (..., 3), world frame, at offsets (..., 2) [world units] along the axes of surfels (...)."""
-    ways = zip(offsets.unbind(-1), axes(surfels), strict=True)
+    ways = zip(offsets.unbind(-1), axes(surfels.quats.detach())[:2], strict=True)
     return surfels.means.detach()[ids] + sum(x[..., None] * axis[ids] for x, axis in ways)
 
 
@@ -181,7 +173,8 @@ def observe(
     count, means = len(model.surfels), model.surfels.means.detach()
     boxes = means.new_tensor([NOWHERE, NOWHERE, -NOWHERE, -NOWHERE]).repeat(count, 1)
     pixels, total, textured = means.new_zeros(count, 2), means.new_zeros(count), means.new_zeros(count)
-    directions, scales, sides = means.new_zeros(count, 3), model.surfels.scales.detach(), axes(model.surfels)
+    directions, scales = means.new_zeros(count, 3), model.surfels.scales.detach()
+    sides = axes(model.surfels.quats.detach())[:2]
     for done, camera in enumerate(cameras, 1):
         camera = camera.to(bare.device)
         out = bare.render(camera)

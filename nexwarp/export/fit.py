@@ -15,6 +15,7 @@ from nexwarp.export.baked_scene import BakedScene
 from nexwarp.kernels.types import ALPHA_MAX
 from nexwarp.model.model import Model
 from nexwarp.ops.atlas import Cut
+from nexwarp.train.losses import SATURATION
 
 WINDOW = {"cuda": 1024, "cpu": 256}  # largest width and height that one step draws
 PASSES = 12.0  # over the views' pixels
@@ -25,7 +26,6 @@ LAST_RATE = 0.05  # relative to the first
 BETAS, SMALLEST = (0.9, 0.99), 1e-12  # of Adam
 STEEPNESS = 40.0, 400.0  # of the coverage of cut-outs, first and last
 LAYERS = 4
-SATURATED = 250 / 255  # a photo's value from which on it says only how bright the scene is at least
 
 
 Views = Sequence[View] | Sequence[Camera]  # photos, or cameras alone
@@ -86,7 +86,7 @@ def fit(
         if window.factors is not None:
             image = image * window.factors
         if window.clipped:
-            image = image.where((window.image < SATURATED) | (image < window.image), window.image)
+            image = image.where((window.image < SATURATION) | (image < window.image), window.image)
         errors = (image - window.image).square()
         loss = errors.mean() if window.mask is None else (errors * window.mask[..., None]).mean()
         optimizer.zero_grad(set_to_none=True)

@@ -190,8 +190,7 @@ class Surfels(nn.Module):
     @property
     def normals(self) -> torch.Tensor:
         """(N, 3) unit normals, world frame: the surfel's z axis. Either side may face the camera."""
-        w, x, y, z = self.quats.unbind(-1)
-        return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
+        return axes(self.quats)[2]
 
     @property
     def scales(self) -> torch.Tensor:
@@ -234,6 +233,17 @@ def turned(one: torch.Tensor, other: torch.Tensor) -> torch.Tensor:
         w * d + x * c - y * b + z * a,
     ]
     return torch.stack(product, dim=-1)
+
+
+def axes(quats: torch.Tensor) -> list[torch.Tensor]:
+    """Return the x, y and z axes of surfels, (N, 3) each, world frame, of unit rotations (N, 4) wxyz."""
+    w, x, y, z = quats.unbind(-1)
+    columns = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
+        [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
+        [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return [torch.stack(column, dim=-1) for column in columns]
 
 
 def check_coefficients(name: str, count: int) -> None:

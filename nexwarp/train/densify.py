@@ -13,7 +13,7 @@ from torch import nn
 from nexwarp.cameras.camera import Camera, reduced
 from nexwarp.errors import check_tensors
 from nexwarp.model.model import Model
-from nexwarp.model.surfels import PARAMETERS, Surfels
+from nexwarp.model.surfels import PARAMETERS, Surfels, axes
 from nexwarp.train.recipe import Config
 
 RELOCATE_EVERY = 10  # rounds: the new surfels have to settle
@@ -184,10 +184,7 @@ def split_surfels(surfels: Surfels, optimizer: torch.optim.Optimizer, rows: torc
     children = sides.nonzero()[:, 0]
     log_scales, means = surfels.log_scales[children], surfels.means[children]
     axis, at = log_scales.argmax(dim=1), torch.arange(len(children), device=children.device)
-    w, x, y, z = surfels.quats[children].unbind(-1)
-    # First two columns of the rotation matrix.
-    x_axis = torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], dim=-1)
-    y_axis = torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], dim=-1)
+    x_axis, y_axis, _ = axes(surfels.quats[children])
     offset = torch.where(axis[:, None] == 0, x_axis, y_axis) * (log_scales[at, axis].exp() / 2)[:, None]
     log_scales[at, axis] -= torch.log(torch.tensor(2.0)).item()
     surfels.means[children] = means + sides[children, None] * offset

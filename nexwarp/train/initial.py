@@ -15,7 +15,7 @@ from nexwarp.kernels.sh import BAND_0
 from nexwarp.model.bounds import check_bounds
 from nexwarp.model.model import Model
 from nexwarp.model.poses import PoseCorrections
-from nexwarp.model.surfels import SOFT, Surfels, turned
+from nexwarp.model.surfels import SOFT, Surfels, axes, turned
 from nexwarp.model.texture import NeuralTexture, Texture, TextureShape
 from nexwarp.train.recipe import Config
 
@@ -155,8 +155,7 @@ def starting_points(
 def quats_towards(normals: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
     """Turn rotations (N, 4) wxyz by the least angle so that their z axes lie along unit normals (N, 3)."""
     quats = torch.nn.functional.normalize(quats, dim=-1)
-    w, x, y, z = quats.unbind(-1)
-    axis = torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=-1)
+    axis = axes(quats)[2]
     normals = torch.where((axis * normals).sum(-1, keepdim=True) < 0, -normals, normals)
     # Half-way quaternion from axis to normal; their angle is at most 90 degrees, so it is never 0.
     turn = torch.cat([1 + (axis * normals).sum(-1, keepdim=True), torch.linalg.cross(axis, normals)], dim=-1)

@@ -11,8 +11,8 @@ from PIL import Image, ImageOps
 import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.data.ply import read_vertices
+from nexwarp.export import baked_scene
 from nexwarp.export.baked_scene import load_baked
-from nexwarp.export.web import baked
 from nexwarp.run.evaluate import psnr
 from nexwarp.run.export import ExportOrder, _diffuse, _photos, export_run
 from nexwarp.run.folder import open_model, read_metrics
@@ -183,7 +183,7 @@ def baked_files(run: Path, path: str | None = None, finetune: bool = True) -> tu
     source = dataclasses.replace(source, path=path or source.path)
     order = ExportOrder("web", run / "page", finetune=finetune)
     export_run(dataclasses.replace(opened, source=source), order, report=lines.append)
-    return [(run / "page" / name).read_bytes() for name in (baked.BAKED_FILE, baked.ATLAS_FILE)], lines
+    return [(run / "page" / name).read_bytes() for name in (baked_scene.BAKED_FILE, baked_scene.ATLAS_FILE)], lines
 
 
 def test_an_export_learns_from_training_photos_alone(finished, tmp_path):

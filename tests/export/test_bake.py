@@ -9,9 +9,10 @@ import torch
 import nexwarp as nw
 from nexwarp.cameras.similarity import upright
 from nexwarp.export.bake import Baked, bake, evaluate, lay_out, observe
+from nexwarp.export.baked_scene import ATLAS_FILE, BAKED_FILE
 from nexwarp.export.glb import CUTOFF, make_cards, save_glb
 from nexwarp.export.splats import gaussians, save_splats_spz
-from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE, encode_atlas, encode_baked, encode_harmonics
+from nexwarp.export.web.baked import encode_atlas, encode_baked, encode_harmonics
 from tests.export.web import support
 from tests.export.web.support import as_stored, psnr, rendered, ring
 from tests.scenes import make_surfels, make_texture, random_scene

@@ -10,9 +10,8 @@ import nexwarp as nw
 from nexwarp import ops
 from nexwarp.errors import FormatError, MissingError
 from nexwarp.export.bake import bake, dimmed
-from nexwarp.export.baked_scene import BakedScene
+from nexwarp.export.baked_scene import BAKED_FILE, BakedScene
 from nexwarp.export.glb import CUTOFF, LEAST_ALPHA, make_cards, save_glb
-from nexwarp.export.web.baked import BAKED_FILE
 from nexwarp.export.web.export import one_file, page_files
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
 from nexwarp.model.surfels import Activated

@@ -8,12 +8,11 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.export.bake import Baked
+from nexwarp.export.baked_scene import ATLAS_FILE, BAKED_FILE, MAGIC
 from nexwarp.export.web.scene_file import array_of, joined_file, scene_arrays, scene_header
 from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels
 
-BAKED_FILE, ATLAS_FILE = "baked.nxb", "atlas.webp"
-MAGIC = b"NXWBAKED"
 QUALITY = 95  # of the lossy picture: 0.1 dB against photos of the demo, at 0.3 of the size of a lossless one
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
 

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE
+from nexwarp.export.baked_scene import ATLAS_FILE, BAKED_FILE
 from nexwarp.export.web.export import static_files
 from nexwarp.export.web.scene_file import SCENE_FILE
 from tests.export.web import support

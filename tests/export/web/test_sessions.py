@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.export.web.baked import ATLAS_FILE, BAKED_FILE
+from nexwarp.export.baked_scene import ATLAS_FILE, BAKED_FILE
 from tests.export.web import support
 from tests.export.web.support import CHROMIUM, FINISHED, POSE, PageTab, psnr
 
