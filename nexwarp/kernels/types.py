@@ -164,6 +164,31 @@ def types(real: type) -> SimpleNamespace:
         shapes: wp.array(dtype=wp.vec3i)  # (N) number of corners, first and last tile row
         margins: reals  # (N) pixels
 
+    @wp.struct
+    class Atlas:
+        """Texels of baked scenes, and where those of each surfel lie."""
+
+        texels: vec4_rows  # (height, width) RGBA
+        boxes: vec4s  # (N) u0, v0, 1 / (u1 - u0), 1 / (v1 - v0), in units of the records' scales
+        rects: vec4s  # (N) column and row of the first texel's centre, and from there to the last one's
+        cutoff: real  # alpha of half a coverage
+        steepness: real  # of the sigmoid; 0 is a threshold
+
+    @wp.struct
+    class Drawn:
+        """What is drawn of a baked scene, or its gradients; and the hits of cut-outs."""
+
+        image: vec3s  # (pixels)
+        alphas: reals
+        ids: int_rows  # (pixels, layers), -1 behind the last
+
+    @wp.struct
+    class TexelSums:
+        """Gradients of a baked scene that all pixels add to."""
+
+        texels: vec4_rows  # (height, width)
+        colors: vec4s  # (N) of plain colours and opacity
+
     constants = {"ALPHA_MIN": ALPHA_MIN, "ALPHA_MAX": ALPHA_MAX, "TRANSMITTANCE_MIN": TRANSMITTANCE_MIN, "TINY": TINY}
     constants |= {"ZERO": 0.0, "HALF": 0.5, "ONE": 1.0, "TWO": 2.0}
     return SimpleNamespace(**locals(), **{name: wp.constant(real(value)) for name, value in constants.items()})

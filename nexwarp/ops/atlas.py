@@ -5,10 +5,10 @@ from typing import NamedTuple
 import torch
 
 from nexwarp.errors import check_tensors
-from nexwarp.kernels.atlas import atlas_types, blend_backward_kernel, blend_kernel, nearest_kernel
+from nexwarp.kernels.atlas import blend, blend_backward, nearest
 from nexwarp.kernels.launch import Sharing
 from nexwarp.native.warp import tile_size_on
-from nexwarp.ops._interop import Argument, Context, first_derivative, launch, struct
+from nexwarp.ops._interop import Argument, Context, first_derivative, launch
 from nexwarp.ops.collect import Walked
 from nexwarp.ops.project import Pinhole, Projection
 from nexwarp.ops.tiles import Tiles
@@ -69,41 +69,35 @@ class _Draw(torch.autograd.Function):
         cards: bool,
         cut: Cut | None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        real, size = scene.real, (scene.camera.height, scene.camera.width)
+        size = scene.camera.height, scene.camera.width
         image, alphas, ids = records.new_empty(*size, 3), records.new_empty(size), None
+        names, atlas = {"cards": cards, "cut": cut is not None}, _atlas(texels, boxes, rects, cut)
         if cut is not None:
             ids = torch.empty(alphas.numel(), cut.layers, dtype=torch.int32, device=records.device)
-        kinds, atlas = atlas_types(real), _atlas(real, texels, boxes, rects, cut)
-        drawn = struct(kinds.Drawn, image=image, alphas=alphas, ids=ids)
-        if cut is not None:
-            scene.launch(nearest_kernel(real, cut.layers), [atlas, drawn])
-        scene.launch(blend_kernel(real, cards, cut is not None), [atlas, drawn])
+            scene.launch(nearest, [atlas, (None, None, ids)], layers=cut.layers, **names)
+        scene.launch(blend, [atlas, (image, alphas, ids)], **names)
         ctx.save_for_backward(texels, boxes, rects, ids, image, alphas)
-        ctx.rest = (scene, cards, cut)
+        ctx.rest = (scene, names, cut)
         return image, alphas
 
     @staticmethod
     @first_derivative
     def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        scene, cards, cut = ctx.rest
+        scene, names, cut = ctx.rest
         texels, boxes, rects, ids, image, alphas = ctx.saved_tensors
-        real, records, kinds = scene.real, scene.records, atlas_types(scene.real)
-        grad_texels, grad_colors = torch.zeros_like(texels), records.new_zeros(len(records), 4)
-        sums = struct(kinds.Sums, texels=grad_texels, colors=grad_colors)
-        grad_image, grad_alphas = (x.contiguous() for x in grads)
-        drawn = struct(kinds.Drawn, image=image, alphas=alphas, ids=ids)
-        incoming = struct(kinds.Drawn, image=grad_image, alphas=grad_alphas)
-        arguments = [*scene.arguments(), _atlas(real, texels, boxes, rects, cut), drawn, incoming]
+        records = scene.records
+        sums = torch.zeros_like(texels), records.new_zeros(len(records), 4)
+        atlas, incoming = _atlas(texels, boxes, rects, cut), tuple(x.contiguous() for x in grads)
+        arguments = [*scene.arguments(), atlas, (image, alphas, ids), incoming]
         threads = (len(scene.tiles.tile_offsets) - 1) * tile_size_on(records.is_cuda) ** 2
         alone = Sharing(smallest=max(threads, 1))  # neighbouring tiles add to the same texels, on a CPU without atomics
-        launch(records, blend_backward_kernel(real, cards, cut is not None), threads, arguments, [sums], sharing=alone)
-        grad_records = torch.zeros_like(records)
+        launch(records, blend_backward, threads, arguments, [sums], sharing=alone, **names)
+        grad_records, (grad_texels, grad_colors) = torch.zeros_like(records), sums
         grad_records[:, 3, :3], grad_records[:, 0, 3] = grad_colors[:, :3], grad_colors[:, 3]
         return grad_records, grad_texels, None, None, None, None, None
 
 
-def _atlas(real: type, texels: torch.Tensor, boxes: torch.Tensor, rects: torch.Tensor, cut: Cut | None) -> Argument:
-    """The struct `Atlas` of the kernels."""
+def _atlas(texels: torch.Tensor, boxes: torch.Tensor, rects: torch.Tensor, cut: Cut | None) -> Argument:
+    """The fields of the struct `Atlas` of the kernels, in their order."""
     cutoff, steepness = (0.0, 0.0) if cut is None else cut[:2]
-    kind = atlas_types(real).Atlas
-    return struct(kind, texels=texels, boxes=boxes, rects=rects, cutoff=cutoff, steepness=steepness)
+    return texels, boxes, rects, cutoff, steepness
