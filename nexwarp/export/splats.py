@@ -14,13 +14,11 @@ import json
 import math
 import os
 import struct
-import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -57,7 +55,6 @@ LARGEST_COORDINATE = 2.0 ** (COORDINATE_BITS - 1 - WRITTEN_BITS) - 1  # values b
 MOST_SHIFT = 12  # more or fewer fractional bits
 SMALLEST_SCALE, LARGEST_SCALE = -10.0, 5.9375  # logarithms, in steps of 1/16
 LARGEST_LOSS = 0.01
-ARRAYS = ("positions", "scales", "rotations", "alphas", "colors", "sh")
 
 
 def save_surfels_ply(path: str | os.PathLike[str], surfels: Surfels) -> None:
@@ -217,14 +214,16 @@ def save_splats_spz(path: str | os.PathLike[str], splats: Gaussians) -> None:
     import gaussforge
 
     _check_any(path, splats)
-    with tempfile.TemporaryDirectory() as folder:
-        ply = Path(folder) / "splats.ply"
-        save_splats_ply(ply, splats)
-        content = ply.read_bytes()
-    library = gaussforge.GaussForge()
-    data = _checked(path, library.read(content, "ply"))
-    count = data["numPoints"]
-    arrays = {name: np.frombuffer(data[name], np.float32).reshape(count, -1) for name in ARRAYS}
+    tensors = {
+        "positions": splats.means,
+        "scales": splats.log_scales,
+        "rotations": splats.quats,
+        "alphas": splats.logit_opacities,
+        "colors": splats.sh[:, 0],
+        "sh": torch.nn.functional.pad(splats.sh[:, 1:], (0, 0, 0, (SPLAT_DEGREE + 1) ** 2 - splats.sh.shape[1])),
+    }
+    count = len(splats.means)
+    arrays = {name: x.detach().float().cpu().numpy() for name, x in tensors.items()}
     reach = np.abs(arrays["positions"]).max(axis=1)
     shift = _shift(float(reach.max()))
     if shift < 0 and (reach >= LARGEST_COORDINATE).mean() <= LARGEST_LOSS:
@@ -244,8 +243,12 @@ def save_splats_spz(path: str | os.PathLike[str], splats: Gaussians) -> None:
             stacklevel=2,
         )
     arrays["positions"] = arrays["positions"] * np.float32(2.0**shift)
-    data |= {name: array[near].tobytes() for name, array in arrays.items()} | {"numPoints": int(near.sum())}
-    packed = bytearray(gzip.decompress(_checked(path, library.write(data, "spz"))))
+    data = {name: array[near].tobytes() for name, array in arrays.items()}
+    data |= {"numPoints": int(near.sum()), "meta": {"shDegree": SPLAT_DEGREE}}
+    answer = gaussforge.GaussForge().write(data, "spz")
+    if "error" in answer:
+        raise FormatError(f"{path}: GaussForge could not write it ({one_line(answer['error'])})")
+    packed = bytearray(gzip.decompress(answer["data"]))
     packed[FRACTION_BYTE] += shift
     write_atomically(Path(path), gzip.compress(packed, mtime=0))
 
@@ -260,13 +263,6 @@ def _shift(farthest: float) -> int:
     if farthest * 2.0**MOST_SHIFT < LARGEST_COORDINATE:
         return MOST_SHIFT
     return max(math.floor(math.log2(LARGEST_COORDINATE / farthest)), -MOST_SHIFT)
-
-
-def _checked(path: str | os.PathLike[str], answer: Mapping[str, Any]) -> Any:
-    """Return what GaussForge returned, unless that is an error."""
-    if "error" in answer:
-        raise FormatError(f"{path}: GaussForge could not write it ({one_line(answer['error'])})")
-    return answer["data"]
 
 
 @dataclass(frozen=True)
