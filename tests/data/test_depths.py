@@ -104,8 +104,12 @@ def write_maps(folder: Path, maps: dict[str, np.ndarray], end: str = ".npy") -> 
 
 
 def load_unfitted(folder: Path, monkeypatch: pytest.MonkeyPatch, **options: Any) -> nw.Scene:
-    monkeypatch.setattr("nexwarp.data.scene.fit_depths", lambda views, *_: views)
-    return nw.load_scene(folder, **options)
+    """A scene with the maps that its loader gives to be fitted."""
+    given: list[list[nw.View]] = []
+    monkeypatch.setattr("nexwarp.data.scene.fit_depths", lambda views, *_: given.append(views) or views)
+    scene = nw.load_scene(folder, **options)
+    assert given == [scene.train]
+    return scene
 
 
 def test_training_photos_have_their_maps(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

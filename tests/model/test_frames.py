@@ -59,13 +59,6 @@ def test_a_staged_camera_renders_what_its_camera_does(device: torch.device) -> N
         assert_same(found, expected, (*BUFFERS, "ids", "colors"))
 
 
-def test_a_cpu_has_no_graphs() -> None:
-    model = finished("cpu")
-    with torch.no_grad():
-        outs = [model.render(camera) for camera in cameras("cpu") for _ in range(3)]
-    assert model.surfels not in frames._graphs and not any(isinstance(out, frames.CapturedRendering) for out in outs)
-
-
 @CUDA
 @pytest.mark.parametrize(
     "options",

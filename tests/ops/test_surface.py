@@ -34,17 +34,10 @@ def assert_everywhere(buffer: torch.Tensor, value: float | list[float], name: st
 
 
 @pytest.mark.parametrize("turned", [False, True])
-@pytest.mark.parametrize("depth", [0.5, 7.0])
-def test_an_opaque_quad_has_its_depth_and_its_normal(depth: float, turned: bool, device: torch.device) -> None:
-    out = draw(facing_quads((depth, 0.99), device=device, turned=turned))
-    for name in DEPTHS:
-        assert_everywhere(getattr(out, name), depth, name)
-    assert_everywhere(out.normals, [0.0, 0.0, -1.0], "normals")
-
-
-def test_depths_of_layers_by_hand(device: torch.device) -> None:
+def test_depths_and_normals_of_layers_by_hand(turned: bool, device: torch.device) -> None:
     """Weights 0.3, 0.7 * 0.6 = 0.42 and 0.28 * 0.5 = 0.14; transmittances 0.7, 0.28 and 0.14."""
-    out = draw(facing_quads((4.0, 0.5), (2.0, 0.3), (3.0, 0.6), device=device))
+    out = draw(facing_quads((4.0, 0.5), (2.0, 0.3), (3.0, 0.6), device=device, turned=turned))
+    assert_everywhere(out.normals, [0.0, 0.0, -1.0], "normals")
     assert_everywhere(out.expected_depth, (0.3 * 2 + 0.42 * 3 + 0.14 * 4) / 0.86, "expected depth")
     assert_everywhere(out.median_depth, 3.0, "median depth")
     assert_everywhere(out.top_depth, 3.0, "top depth")

@@ -79,13 +79,6 @@ def test_a_kill_releases_the_lock_although_a_forked_child_lives(holder):
     assert list(run.iterdir()) == []
 
 
-def test_the_lock_is_free_after_an_error(tmp_path):
-    for _ in range(2):
-        with pytest.raises(ZeroDivisionError), locked_run(tmp_path):
-            raise ZeroDivisionError
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.fixture
 def flock_fails(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Let the system refuse locks with an error."""

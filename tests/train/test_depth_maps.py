@@ -69,25 +69,6 @@ def test_maps_draw_the_surfels(mapped: nw.Scene) -> None:
     assert error(LossWeights(depth=0.0, depth_maps=3.0)) < 0.9 * error(LossWeights(depth=0.0, depth_maps=0.0))
 
 
-def test_a_wrong_scale_gives_the_same_targets(tiny_folder: Path, tmp_path: Path) -> None:
-    targets = []
-    for factor in (1.0, 3.7):
-        folder = tmp_path / f"{factor}"
-        folder.mkdir()
-        for name in ("images", "sparse"):
-            (folder / name).symlink_to(tiny_folder / name)
-        (folder / "depths").mkdir()
-        for view in nw.load_scene(tiny_folder).train:
-            pixels, depths = view.camera.project(present(view.points))
-            plane = np.linalg.lstsq(np.c_[pixels, np.ones(len(pixels))], depths.numpy(), rcond=None)[0]
-            rows, columns = np.mgrid[0 : view.camera.height, 0 : view.camera.width]
-            plane = plane[0] * (columns + 0.5) + plane[1] * (rows + 0.5) + plane[2]
-            np.save(folder / "depths" / f"{Path(view.name).stem}.npy", factor * np.maximum(plane, 0.5))
-        targets.append([present(view.depth).float() for view in nw.load_scene(folder, follow_links=True).train])
-    for one, other in zip(*targets, strict=True):
-        assert ((one / other - 1).abs() < 2e-3).all()  # half precision, twice
-
-
 def test_a_run_with_maps_resumes_and_other_maps_are_another_scene(mapped: nw.Scene, tmp_path: Path) -> None:
     assert_resumed_alike(trained(mapped, small()), tmp_path)
     other = dataclasses.replace(mapped, train=[mapped.train[0], *(at(view, 4.0) for view in mapped.train[1:])])
