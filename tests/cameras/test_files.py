@@ -9,7 +9,6 @@ import torch
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.cameras.nerfstudio import load_camera_path, save_camera_path, save_transforms
-from nexwarp.cameras.paths import look_at
 from tests.model_file_support import refused
 from tests.scenes import intrinsics, make_camera, random_scene, rigid
 
@@ -59,21 +58,6 @@ def test_camera_path_comes_back(tmp_path: Path, centred: bool) -> None:
     # nerfstudio's entries hold no more than these, and cannot say more.
     extra = set() if centred else {"fl_x", "fl_y", "cx", "cy"}
     assert set(data["camera_path"][0]) == {"camera_to_world", "fov", "aspect"} | extra
-
-
-def test_matrices_are_opengl_camera_to_world(tmp_path: Path) -> None:
-    """A camera at (1, 2, 3) that looks along +y with z up: its backward axis is -y, its up axis z."""
-    position, up = torch.tensor([1.0, 2.0, 3.0]).double(), torch.tensor([0.0, 0.0, 1.0]).double()
-    viewmat = look_at(position, position + torch.tensor([0.0, 1.0, 0.0]).double(), up)
-    one = Camera(viewmat, intrinsics(24, 24, 32, 24), 64, 48)
-    save_camera_path(tmp_path / "path.json", [one])
-    save_transforms(tmp_path / "transforms.json", {"a": one})
-    expected = torch.tensor([[1.0, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1]]).double()
-    path = json.loads((tmp_path / "path.json").read_text())["camera_path"][0]
-    frame = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
-    assert torch.allclose(torch.tensor(path["camera_to_world"]).double().view(4, 4), expected)
-    assert torch.allclose(torch.tensor(frame["transform_matrix"]).double(), expected)
-    assert path["fov"] == pytest.approx(90.0) and path["aspect"] == pytest.approx(4 / 3)
 
 
 def written(tmp_path: Path, data: Any) -> Path:

@@ -7,7 +7,7 @@ import torch
 
 from nexwarp.errors import StorageError
 from nexwarp.io import files
-from nexwarp.io.files import is_temporary, temporary_name, write_atomically, write_together, written_aside
+from nexwarp.io.files import is_temporary, temporary_name, write_atomically, write_together
 from nexwarp.run.folder import keep_camera_path
 from nexwarp.run.log import _open_log
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
@@ -47,12 +47,6 @@ def test_long_names_leave_room_for_what_a_temporary_name_adds(tmp_path):
     for stem in ("n" * 250, "é" * 125):
         write_atomically(tmp_path / f"{stem}.png", b"")
     assert len(os.listdir(tmp_path)) == 2
-
-
-def test_folders_of_a_failed_write_are_removed(tmp_path):
-    with pytest.raises(ValueError, match="mine"), written_aside(tmp_path / "a" / "b" / "file"):
-        raise ValueError("mine")
-    assert os.listdir(tmp_path) == []
 
 
 def test_camera_paths_of_viewers_at_the_same_time_all_stay(tmp_path):

@@ -61,7 +61,9 @@ def pure(model: nw.Model, camera: nw.Camera, **parts: Any) -> nw.Rendering:
 
 
 @pytest.mark.parametrize("saved", ["photos", "mean"])
-@pytest.mark.parametrize("flags", [[], ["--buffers"], ["--exposure", "mean"], ["--exposure", "mean", "--buffers"]])
+@pytest.mark.parametrize(
+    "flags", [[], ["--buffers"], ["--exposure", "mean"], ["--exposure", "mean", "--buffers"], ["--order", "distance"]]
+)
 def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flags: list[str], saved: Exposure) -> None:
     """To the bit, with exposures, vignetting and detail limits, and the buffers too; by default as the model says."""
     run, cameras = tmp_path / "run", cameras_of()
@@ -74,6 +76,9 @@ def test_a_rendering_is_the_picture_that_the_command_writes(tmp_path: Path, flag
     assert cli.main(["render", str(run), "--set", "test", "--device", "cpu", *flags]) == 0
     model = nw.load(run)
     changes: RenderChanges = {"exposure": "mean"} if "mean" in flags else {}
+    if "--order" in flags:
+        changes["order"] = "distance"
+        assert not torch.equal(model.render(cameras[0], **changes).image, model.render(cameras[0]).image)
     for name, camera in zip(names, cameras, strict=True):
         with torch.no_grad():
             out = model.render(camera, **changes)

@@ -1,15 +1,11 @@
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 import nexwarp as nw
-from nexwarp.errors import FormatError, SettingError
+from nexwarp.errors import FormatError
 from nexwarp.export.web.scene_file import scene_arrays
-from nexwarp.io.pictures import to_uint8
 from nexwarp.model import graphs as frames
 from nexwarp.ops.tiles import Order
-from nexwarp.run.render import PictureJob, RenderJob, RenderOrder
 from tests import scenes
 from tests.tolerances import assert_close
 
@@ -59,16 +55,3 @@ def test_the_order_is_kept_in_files_and_named_where_it_is_bad(tmp_path):
         nw.render(model.surfels, None, scenes.make_camera(scene), order=1)  # type: ignore[arg-type]
     with pytest.raises(FormatError, match="order: expected depth, which the web page draws, got distance"):
         scene_arrays(model)
-
-
-def test_the_command_renders_by_the_order_asked_for(tmp_path):
-    scene = scenes.named_scene("wide", torch.float32, "cpu")
-    model, camera = nw.Model(scenes.make_surfels(scene), None), scenes.make_camera(scene)
-    camera = nw.Camera(camera.viewmat.detach(), camera.K, camera.width, camera.height, camera.near)
-    for order in ORDERS:
-        file = tmp_path / f"{order}.png"
-        RenderJob([PictureJob(file, camera)], RenderOrder(set="test", order=order)).render(model)
-        expected = to_uint8(model.render(camera, order=order).image.detach())
-        assert (np.asarray(Image.open(file)) == expected.numpy()).all()
-    with pytest.raises(SettingError, match="--order: expected depth or distance, got 'near'"):
-        RenderOrder(set="test", order="near").check()

@@ -242,6 +242,7 @@ def refuses(run: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., None
         (["--size", "100"], ["--size: expected WIDTHxHEIGHT of 1 to 16384 pixels each, got '100'"]),
         (["--scale", "0"], ["--scale: expected a number above 0, got 0"]),
         (["--scale", "1000"], ["--scale: expected at most 16384 pixels a side, got 64000x48000"]),
+        (["--order", "near"], ["--order: expected depth or distance, got 'near'"]),
         (["--exposure", "auto"], ["--exposure: expected photos or mean, got 'auto'"]),
         (["--scale", "2", "--size", "9x9"], ["--size, --scale: expected at most one"]),
         (["--camera", "cube"], ["--camera: expected pinhole, panorama, fisheye, got"]),
