@@ -46,14 +46,6 @@ def child():
 parent, expected = os.getpid(), results()
 """.replace("SECONDS", str(SECONDS))
 
-FORK = """
-number = os.fork()
-if number == 0:
-    child()
-    os._exit(0)
-assert os.waitpid(number, 0)[1] == 0
-"""
-
 MULTIPROCESSING = """
 process = multiprocessing.get_context("fork").Process(target=child)
 process.start()
@@ -61,7 +53,6 @@ process.join()
 assert process.exitcode == 0
 """
 
-# Another thread renders all the time, and holds the lock of Warp's sorts when the fork comes.
 AFTER = """
 assert torch.get_num_threads() == 3
 assert all(torch.equal(a, b) for a, b in zip(results(), expected)), "the parent renders otherwise after the fork"
@@ -73,6 +64,6 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork") or not hasattr(signal, "
 
 
 def test_a_forked_process_renders_as_its_parent():
-    done = run_python("-c", PARENT + FORK + MULTIPROCESSING + AFTER, timeout=3 * SECONDS)
+    done = run_python("-c", PARENT + MULTIPROCESSING + AFTER, timeout=3 * SECONDS)
     assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.splitlines()[-3:] == ["child True", "child True", "parent"]
+    assert done.stdout.splitlines()[-2:] == ["child True", "parent"]

@@ -27,21 +27,16 @@ def arguments(slots: int = 2) -> dict[str, Any]:
     return {"image": image, "textured": textured, "weights": weights, "target": target}
 
 
-def test_photo_losses_are_the_papers_total() -> None:
-    x = arguments()
+@pytest.mark.parametrize(("slots", "counted"), [(1, 1), (2, 2), (3, 2), (4, 2)])
+def test_photo_losses_are_the_papers_total(slots: int, counted: int) -> None:
+    """The heaviest hits count as textured for the term of the weights alone: the texture's has all of them."""
+    x = arguments(slots)
+    x["weights"].requires_grad_()
     terms = losses.photo_losses(**x, factors=LossWeights())
     assert set(terms) == {"l1", "dssim", "texture", "alpha"}
     image, target = x["image"].clamp(0, 1), x["target"]
     total = 0.8 * reference.l1(image, target) + 0.2 * reference.dssim(image, target)
     assert_close(terms["l1"] + terms["dssim"], total, kind="value", name="image")
-
-
-@pytest.mark.parametrize(("slots", "counted"), [(1, 1), (2, 2), (3, 2), (4, 2)])
-def test_the_heaviest_hits_count_as_textured(slots: int, counted: int) -> None:
-    """For the term of the weights alone: the texture's has all of them."""
-    x = arguments(slots)
-    x["weights"].requires_grad_()
-    terms = losses.photo_losses(**x, factors=LossWeights())
     alpha = reference.alpha(x["weights"].detach()[..., :counted])
     assert_close(terms["alpha"], 0.005 * alpha, kind="value", name="alpha")
     (grad,) = torch.autograd.grad(terms["alpha"], x["weights"], retain_graph=True)

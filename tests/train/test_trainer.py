@@ -8,16 +8,11 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.run.evaluate import evaluate
 from nexwarp.train.recipe import DensifyConfig, LearningRates
 from tests.narrowing import neural
 from tests.scene_writers import with_exposures
 from tests.tolerances import assert_close, assert_equal
 from tests.trainer_support import OFTEN, TEXTURE, assert_resumed_alike, assert_same_state, rescaled, small, trained
-
-
-def mean_psnr(trainer: nw.Trainer, views: list[nw.View]) -> float:
-    return evaluate(trainer.model(), views)["psnr"]
 
 
 def test_a_trainer_is_freed_with_its_last_reference(scene):
@@ -64,17 +59,6 @@ def test_deterministic_runs_are_the_same_on_cuda(scene):
     assert first.exposures is not None and first.detail_limits is not None
     for model in others:
         assert_equal(model.state_dict(), first.state_dict())
-
-
-def test_it_learns(scene):
-    # On black: on the photos' mean colour a run starts with less to learn.
-    trainer = nw.Trainer(scene, small(iterations=80, max_surfels=400, background=(0.0, 0.0, 0.0)), "cpu")
-    before, losses = mean_psnr(trainer, scene.train), []
-    trainer.run(lambda progress: losses.append(progress.loss()))
-    epoch = len(scene.train)
-    assert all(math.isfinite(loss) for loss in losses) and sum(losses[-epoch:]) < 0.8 * sum(losses[:epoch])
-    after = mean_psnr(trainer, scene.train)
-    assert after >= before + 2.0, f"{before:.2f} -> {after:.2f} dB"
 
 
 def test_progress_tells_what_happened(scene):

@@ -109,12 +109,3 @@ def test_no_surfels_and_no_texture_can_be_looked_at(camera, model):
         pixels = drawn(nw.Model(none, None, options=OPTIONS), [camera], Settings(mode)).pixels
         assert pixels.shape == (48, 64, 3) and (mode in ("image", "alpha") or not pixels.any())
     assert drawn(model.bare(), [camera], Settings(max_hits=0)).pixels.any() and set(TEXTURED) == {"image", "textured"}
-
-
-def test_settings_take_what_can_be_meant():
-    for name, value, clamped in (("max_hits", 99, 8), ("sh_degree", -5, 0), ("slot", 0, 1)):
-        assert getattr(Settings().changed(name, value), name) == clamped
-    wrong = [("mode", "rm -rf"), ("max_hits", "2"), ("max_hits", 2.5), ("slot", True), ("as_trained", 1)]
-    for name, value in wrong:  # type: ignore[assignment]
-        with pytest.raises(ValueError, match=name):
-            Settings().changed(name, value)

@@ -4,6 +4,7 @@ import socket
 
 import pytest
 
+from nexwarp.viewer.modes import Settings
 from tests.cli.support import refused
 from tests.viewer.support import Client, serving, wait_for
 
@@ -48,14 +49,18 @@ def test_nonsense_is_dropped_and_hurts_nobody(model, capfd):
     with serving(model) as viewer, Client(viewer) as good, Client(viewer) as bad:
         good.look()
         bad.look()
+        mode = bad.control("Show")
         wait_for(lambda: len(viewer.sessions) == 2)
         session = viewer.sessions[max(viewer.sessions)]
         slider = session.controls["max_hits"]
         uuid = slider._impl.uuid
         wait_for(lambda: session.drawn_version == session.version)
         version = session.version
-        for value in ("many", None, [1, 2], math.nan, {"a": 1}):
-            bad.send("GuiUpdateMessage", uuid=uuid, updates={"value": value})
+        others = {name: control._impl.uuid for name, control in session.controls.items()}
+        wrong_values = [(uuid, value) for value in ("many", "2", None, [1, 2], 2.5, math.nan, {"a": 1})]
+        wrong_values += [(others["slot"], True), (others["as_trained"], 1), (mode, "rm -rf")]
+        for control, value in wrong_values:
+            bad.send("GuiUpdateMessage", uuid=control, updates={"value": value})
         bad.send("GuiUpdateMessage", uuid=uuid, updates={"removed": True})
         bad.send("GuiUpdateMessage", uuid=uuid, updates={"update_cb": None})
         bad.send("GuiUpdateMessage", uuid="of an older page", updates={"value": 3})
@@ -66,9 +71,11 @@ def test_nonsense_is_dropped_and_hurts_nobody(model, capfd):
             bad.look(**wrong)
         for size in (0, 10**9):
             bad.look(image_width=size)
+        bad.send("GuiUpdateMessage", uuid=others["sh_degree"], updates={"value": -5})
         bad.send("GuiUpdateMessage", uuid=uuid, updates={"value": 99})
         wait_for(lambda: session.settings.max_hits == 8 and slider.value == 8)  # set one after the other
-        assert not slider._impl.removed and session.version == version + 1 and session.viewpoint is not None
+        assert session.settings == Settings(max_hits=8, sh_degree=0) and session.version == version + 2
+        assert not slider._impl.removed and session.viewpoint is not None
         assert session.viewpoint.width == 96 and math.isfinite(session.viewpoint.fov)
         bad.socket.send(b"\xc1 no message at all")
         wait_for(lambda: len(viewer.sessions) == 1)  # it is shown out
