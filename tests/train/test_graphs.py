@@ -26,8 +26,8 @@ SETTINGS: dict[str, Any] = {
 }
 
 
-def trained(scene: nw.Scene, losses: Any = None, **changes: Any) -> nw.Trainer:
-    trainer = nw.Trainer(scene, Config(**(SETTINGS | changes)), "cuda", losses=losses)
+def trained(scene: nw.Scene, losses: Any = None, teachers: Any = (), **changes: Any) -> nw.Trainer:
+    trainer = nw.Trainer(scene, Config(**(SETTINGS | changes)), "cuda", losses=losses, teachers=teachers)
     trainer.run()
     return trainer
 
@@ -110,11 +110,8 @@ def test_the_first_step_after_a_round_is_captured(tiny_scene: nw.Scene, monkeypa
 
 def test_teachers_too(tiny_scene: nw.Scene) -> None:
     """Steps with a teacher's picture have the graph of steps with photos."""
-    teachers, runs = [trained(tiny_scene, seed=seed).finish() for seed in (1, 2)], []
-    for graphs in (False, True):
-        runs.append(nw.Trainer(tiny_scene, Config(**(SETTINGS | {"cuda_graphs": graphs})), "cuda", teachers=teachers))
-        runs[-1].run()
-    launched, replayed = runs
+    teachers = [trained(tiny_scene, seed=seed).finish() for seed in (1, 2)]
+    launched, replayed = (trained(tiny_scene, None, teachers, cuda_graphs=graphs) for graphs in (False, True))
     assert graphs_of(replayed) == 1
     assert_same_state(replayed, launched)
 
