@@ -21,7 +21,7 @@ from nexwarp.data.images import image_size
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import DEMO, SceneSource, demo_folder, parse_color
 from nexwarp.data.transforms import lens_keys
-from nexwarp.errors import RunError, SettingError
+from nexwarp.errors import OutOfMemoryError, RunError, SettingError
 from nexwarp.export.bake import Progress
 from nexwarp.export.baked_scene import GLB, BakedScene, load_baked
 from nexwarp.export.fit import Views
@@ -45,6 +45,7 @@ from nexwarp.model.crop import REGIONS
 from nexwarp.model.edit import moved_poses, moved_surfels
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
+from nexwarp.model.texture import NeuralTexture
 from nexwarp.run.edit import MIDDLE, edited, subject_crop
 from nexwarp.run.evaluate import compared, lpips_vgg, psnr, ssim, weights_file
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, METRICS_FILE, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
@@ -85,7 +86,7 @@ class ExportOrder:
     alpha: Annotated[str, option("{mask,blend}")] = "mask"
     """Of glb, usd: mask cuts surfels out, which all programs draw; blend is closer to photos, in those that sort."""
     finetune: Annotated[bool, option(None, "to the training photos, where they are")] = True
-    """Fit what is baked to the model's renderings alone."""
+    """Fit what is baked to the model's renderings alone, without more training."""
     crop: Annotated[
         bool, option(None, "glb and usd keep what photos all around look at, if the scene is ten times as large")
     ] = True
@@ -122,7 +123,7 @@ class ExportOrder:
         if self.alpha not in ALPHAS:
             raise SettingError(f"--alpha: expected {' or '.join(ALPHAS)}, got {self.alpha!r}")
         for kind, names in OPTIONS.items():
-            asked = [f"--{name}" for name in names if getattr(self, name) not in (None, "", False)]
+            asked = [f"--{name}" for name in names if (x := getattr(self, name)) is not None and x not in ("", False)]
             if asked and self.format != kind:
                 raise SettingError(f"{asked[0]}: expected together with --format {kind}, got --format {self.format}")
         if not re.fullmatch(r"(https?://[^\s/]+\S*)?", self.url):
@@ -201,6 +202,9 @@ def _export(
 ) -> Sequence[Path]:
     """Write the files of a format."""
     files = [folder / name for name in EXPORTS[order.format]]
+    if order.format == "compact":  # which needs no cameras
+        save_model(files[0], opened.model, compact=_noise(opened) if order.noise is None else order.noise)
+        return files
     views = {name: camera for members in opened.cameras.values() for name, camera in members.items()}
     # What is baked learns from no test view, not even from its pose.
     seen: Views = scene.train if scene is not None else [*opened.cameras.get(TRAIN, {}).values()]
@@ -214,8 +218,6 @@ def _export(
         voxel, far = (None if x is None else x / scale for x in (order.voxel, order.far))
         mesh = extract_mesh(model, opened.trained_cameras, voxel=voxel, far=far, observe=observe)
         save_mesh(files[0], mesh.moved(opened.frame))
-    elif order.format == "compact":
-        save_model(files[0], opened.model, compact=_noise(opened) if order.noise is None else order.noise)
     else:
         cards = None
         if order.format in CARDS:
@@ -284,18 +286,30 @@ def _collision(opened: OpenedModel, device: torch.device | str, observe: Progres
 
 
 def _diffuse(opened: OpenedModel, scene: Scene, device: torch.device | str, observe: Progress) -> Model:
-    """Train a run's model on, with one colour from all directions, as cards have it; no surfel is added."""
+    """Train a run's model on, with one colour from all directions, as cards have it; no surfel is added.
+
+    A cropped model stays as it is: the photos do not say where it ends. So does one that cannot be trained, with a
+    warning.
+    """
     before, config = opened.model, opened.config or DEFAULT
+    if _is_cropped(opened) or type(before.texture) is not NeuralTexture:
+        return before.to(device)
     iterations = max(round(DIFFUSE_SHARE * config.iterations), 1)
     settings: dict[str, object] = dict.fromkeys(("sh_degree", "teachers", "smooth_sh"), 0)
     settings |= {"densify.fraction": 0.0, "densify.relocate": 0.0, "refine_poses": False, "mask_mode": MASK_MODES[0]}
     settings |= {"exposures": before.exposures is not None, "max_surfels": max(len(before.surfels), MIN_SURFELS)}
-    config = with_settings(config, settings | {"iterations": iterations, "steps_a_photo": None})
+    settings |= {"background": before.options.background, "iterations": iterations, "steps_a_photo": None}
+    config = with_settings(config, settings)
 
     def report(step: StepReport) -> None:
         observe("training with one colour from all directions", step.iteration, iterations)
 
-    model = train(scene, config, device=device, init=before, callbacks=[report])
+    try:
+        model = train(scene, config, device=device, init=before, callbacks=[report])
+    except (ValueError, OutOfMemoryError) as error:
+        why = f"the model is not trained with one colour from all directions ({one_line(error)})"
+        warnings.warn(f"{why}; --no-finetune leaves that out", stacklevel=2)
+        return before.to(device)
     model.exposures = None if before.exposures is None else before.exposures.to(device)
     return model
 
@@ -315,14 +329,14 @@ def _photos(opened: OpenedModel, device: torch.device | str, observe: Progress) 
     groups = []
     for views in (scene.train, scene.test):
         shown = [(view, *compared(opened.model, view, mode)) for view in views]
-        groups.append([replace(view, image=image, mask=mask, alpha=None) for view, image, mask in shown])
+        groups.append([replace(view, image=image, mask=mask) for view, image, mask in shown])
     cameras = opened.cameras.get(TRAIN, {})
     groups[0] = [replace(view, camera=cameras.get(view.name, view.camera)) for view in groups[0]]
     if _is_cropped(opened):
         models = [model.bare().to(device) for model in (opened.trained, opened.model)]
         groups = [[_masked(view, *models) for view in group] for group in groups]
     test = [view for view in groups[1] if view.mask is None or view.mask.any()]
-    return replace(scene, train=groups[0], test=test, random_background=False)
+    return replace(scene, train=groups[0], test=test)
 
 
 def _masked(view: View, whole: Model, part: Model) -> View:

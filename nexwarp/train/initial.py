@@ -91,7 +91,7 @@ def initial_texture(scene: Scene, config: Config, surfels: Surfels, start: Start
         texture = texture(scene, surfels)
     if texture is None and init is not None and config.max_hits:
         given = init.texture
-        texture = given.up_to(config.sh_degree) if isinstance(given, NeuralTexture) else copy.deepcopy(given)
+        texture = given.up_to(config.sh_degree) if type(given) is NeuralTexture else copy.deepcopy(given)
     if texture is None:
         return NeuralTexture(**texture_shape(scene, config))
     if not isinstance(texture, Texture):

@@ -150,6 +150,10 @@ def test_cards_come_from_a_model_with_one_colour_from_all_directions(finished, m
         return np.mean([psnr(x, view.image, view.mask) for x, view in zip(images, photos.train, strict=True)]).item()
 
     assert quality(model) > quality(opened.model) + 0.5
+    assert model.options.background == opened.model.options.background
+    with pytest.warns(UserWarning, match="not trained with one colour .* whose scale"):
+        same = _diffuse(opened, dataclasses.replace(photos, scale=2 * photos.scale), "cpu", lambda *_: None)
+    assert same is opened.model
 
 
 @pytest.mark.parametrize(
@@ -211,3 +215,15 @@ def test_an_export_learns_from_training_photos_alone(finished, tmp_path):
     assert without != files and not lines
     with pytest.warns(UserWarning, match="the photos cannot be read .* nothing is fitted to them"):
         assert baked_files(finished, path=str(tmp_path / "gone")) == (without, [])
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("kind", ["web", "glb"])
+def test_a_gpu_tells_what_the_cpu_tells(finished, tmp_path, kind):
+    lines: list[str] = []
+    for device in ("cpu", "cuda"):
+        export_run(
+            open_model(finished), ExportOrder(kind, tmp_path / device, alpha="blend"), device, report=lines.append
+        )
+    cpu, cuda = ([float(x) for x in re.findall(r"([\d.]+) dB", line)] for line in lines)
+    assert cuda == pytest.approx(cpu, abs=0.3)
