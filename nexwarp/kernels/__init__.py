@@ -27,8 +27,8 @@ frozen, and where the paper defines it.
 
 Functions stand at the top level and serve float32 and float64, which is what the proofs use: their annotations, such as
 `Vec3`, are Any to Warp, and a constant is `type(x)(0.5)`, as Warp takes a Python float as float32. Kernels need their
-types: a `@per_real` kernel is written once over those of `types.types`, and others are made by cached factories. What
-depends on the length of the K-buffer is closed over it.
+types: a `@per_real` kernel is written once over those of `types.types`, and others are made by cached factories. The
+length of the K-buffer is a name of the kernel.
 
 A kernel's first argument is `first`, the offset of its thread range: a CPU launch is one serial loop, so `launch.py`
 splits the range over Python threads. Whatever is written is therefore owned by one thread: no kernel relies on CPU
