@@ -195,10 +195,14 @@ def types(real: type) -> SimpleNamespace:
 
 
 class PerReal:
-    """A function of Warp that is written once, and made for a scalar type and values of names of its own.
+    """A function of Warp that is written once, and compiled for a scalar type and for values of `names`.
 
-    In its annotations, which must be strings, and in its body `real`, `vec3`, `ONE` and so on are those of
-    `types(real)`, and `names` what the call says; floats are real, and what else is written so is made for the same.
+    Calling it with both returns the compiled form. In its body and annotations, which must be strings:
+
+    * `real`, `vec3`, `ONE` and so on are those of `types(real)`;
+    * each of `names`, such as `max_hits`, is the value that the call gives;
+    * float constants of the module have the scalar type;
+    * other `PerReal` functions are compiled for the same scalar type and values.
     """
 
     def __init__(self, make: Callable[..., Any], names: tuple[str, ...] | None, function: FunctionType) -> None:

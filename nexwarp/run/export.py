@@ -286,10 +286,10 @@ def _collision(opened: OpenedModel, device: torch.device | str, observe: Progres
 
 
 def _diffuse(opened: OpenedModel, scene: Scene, device: torch.device | str, observe: Progress) -> Model:
-    """Train a run's model on, with one colour from all directions, as cards have it; no surfel is added.
+    """Continue a run's training with one colour from all directions, as cards have it; no surfel is added.
 
-    A cropped model stays as it is: the photos do not say where it ends. So does one that cannot be trained, with a
-    warning.
+    Returns the model unchanged where it is cropped, as the photos then have no loss around its edge, and where its
+    texture cannot be baked. Warns and returns it unchanged where training fails.
     """
     before, config = opened.model, opened.config or DEFAULT
     if _is_cropped(opened) or type(before.texture) is not NeuralTexture:

@@ -132,9 +132,9 @@ def _in_child(order: Order, scene: Path, observe: Observer) -> SfmReport:
                     answer = pickle.load(child.stdout)
                     if isinstance(answer, tuple):
                         observe(*answer)
-            except EOFError:  # it has ended
+            except EOFError:  # it has ended without an answer
                 pass
-            except pickle.UnpicklingError:  # it has ended amid a word, or will not be understood
+            except pickle.UnpicklingError:  # it was killed while it wrote, or wrote something else
                 child.kill()
         except BaseException:
             child.kill()
