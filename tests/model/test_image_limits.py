@@ -184,7 +184,7 @@ def test_tensors_on_the_meta_device_are_named():
 @pytest.mark.cuda
 def test_tensors_on_another_device_are_named():
     surfels, texture, camera = parts("cuda")
-    with pytest.raises(ValueError, match=r"^K: expected a tensor on cuda:0 as viewmat is, got one on cpu$"):
+    with pytest.raises(ValueError, match=r"^K: expected a tensor on cuda:0, got one on cpu$"):
         nw.Camera(camera.viewmat, camera.K.cpu(), camera.width, camera.height)
     with pytest.raises(ValueError, match=r"^camera\.K: expected a tensor on cuda:0, got one on cpu$"):
         nw.render(surfels, texture, moved(camera, camera.K.cpu()))

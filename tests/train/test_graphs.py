@@ -26,8 +26,8 @@ SETTINGS: dict[str, Any] = {
 }
 
 
-def trained(scene: nw.Scene, losses: Any = None, teachers: Any = (), **changes: Any) -> nw.Trainer:
-    trainer = nw.Trainer(scene, Config(**(SETTINGS | changes)), "cuda", losses=losses, teachers=teachers)
+def trained(scene: nw.Scene, own_losses: Any = None, teachers: Any = (), **changes: Any) -> nw.Trainer:
+    trainer = nw.Trainer(scene, Config(**(SETTINGS | changes)), "cuda", losses=own_losses, teachers=teachers)
     trainer.run()
     return trainer
 
