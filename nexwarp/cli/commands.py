@@ -68,9 +68,7 @@ class Process:
     def __call__(self, console: Console) -> None:
         """Make the scene."""
         self.make(console)
-        console.print(
-            f"next: nexwarp train {shlex.quote(str(self.scene))}", soft_wrap=True, markup=False, highlight=False
-        )
+        console.print(f"next: nexwarp train {shlex.quote(str(self.scene))}")
 
     def make(self, console: Console) -> None:
         """Make the scene, and print the report."""
@@ -78,7 +76,7 @@ class Process:
             report = process(self.source, self.scene, self.frames, self.settings, observe=observe)
         console.print(display.results_table(report.rows(), str(self.scene)))
         for line in report.lines():
-            console.print(line, soft_wrap=True, markup=False, highlight=False)
+            console.print(line)
 
 
 def needs_cameras(source: SceneSource) -> bool:
@@ -107,7 +105,7 @@ def make_scene(source: Path, console: Console) -> None:
         except READ_ERRORS:
             made_of = None
         if made_of == source_identity(source):
-            console.print(f"{source}: the scene {scene} was made of it before", soft_wrap=True, highlight=False)
+            console.print(f"{source}: the scene {scene} was made of it before")
             return
     if scene.exists():
         raise RunError(
@@ -115,7 +113,7 @@ def make_scene(source: Path, console: Console) -> None:
             f"make a scene with nexwarp process {source} SCENE, and train that"
         )
     what = "photos" if source.is_dir() else "a video"
-    console.print(f"{source}: {what} without cameras, so {scene} is made first", soft_wrap=True, highlight=False)
+    console.print(f"{source}: {what} without cameras, so {scene} is made first")
     Process(source, scene).make(console)
 
 
@@ -227,12 +225,12 @@ class Render:
         job = self.pictures.prepare(opened)
         if self.pictures.path is None and job.path is not None:
             surround = "surround" if job.path == "ellipse" else "do not surround"
-            console.print(f"--path {job.path}, as the cameras {surround} what they look at", soft_wrap=True)
+            console.print(f"--path {job.path}, as the cameras {surround} what they look at")
         with display.counting(console, "rendering", len(job)) as done:
             job.render(model, done)
-        console.print(f"{len(job)} pictures in {opened.folder / RENDERS_FOLDER}", soft_wrap=True)
+        console.print(f"{len(job)} pictures in {opened.folder / RENDERS_FOLDER}")
         if self.pictures.video is not None:
-            console.print(f"{job.seconds:.2f} s of video in {self.pictures.video}", soft_wrap=True)
+            console.print(f"{job.seconds:.2f} s of video in {self.pictures.video}")
 
 
 @dataclass
@@ -264,7 +262,7 @@ class Export:
             with console.status("exporting"):
                 files = export_run(opened, self.files, device)
         for line in (*map(str, files), *lines):
-            console.print(line, soft_wrap=True, highlight=False)
+            console.print(line)
 
 
 @dataclass
@@ -295,7 +293,7 @@ class Edit:
         for number, edit in enumerate(opened.edits, 1):
             console.print(f"{number}. {edit}")
         for line in described(opened):
-            console.print(line, soft_wrap=True)
+            console.print(line)
 
     def _change(self, opened: OpenedModel, device: torch.device, console: Console) -> OpenedModel:
         """Write what the order asks for; return the run as it is then."""
@@ -399,13 +397,8 @@ class ViewCommand:
             show_until_interrupted(viewer, console)
 
 
-def print_url(viewer: "Viewer", console: Console, more: str = "") -> None:
-    """Print the viewer's address on one line, exactly: it may hold a token, or brackets."""
-    console.print(f"viewer: {viewer.url}{more}", soft_wrap=True, markup=False)
-
-
 def show_until_interrupted(viewer: "Viewer", console: Console) -> None:
     """Serve the viewer of a finished model until Ctrl-C."""
-    print_url(viewer, console, " (Ctrl-C ends it)")
+    console.print(f"viewer: {viewer.url} (Ctrl-C ends it)")
     with suppress(KeyboardInterrupt):
         viewer.show()

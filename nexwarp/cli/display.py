@@ -42,7 +42,7 @@ def device_name(device: torch.device) -> str:
 
 def warn(console: Console, text: str) -> None:
     """Print a warning."""
-    console.print(f"warning: {text}", soft_wrap=True, markup=False, highlight=False)
+    console.print(f"warning: {text}")
 
 
 @contextmanager
@@ -89,7 +89,7 @@ def training(
             text += f"  {time_left((total - step.iteration + after) / rate)}"
             progress.update(task, completed=step.iteration, text=text)
             if not console.is_terminal:
-                console.print(f"iteration {step.iteration:,}/{total:,}  {text}", soft_wrap=True)
+                console.print(f"iteration {step.iteration:,}/{total:,}  {text}")
 
         yield show
 
@@ -121,7 +121,7 @@ def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
             if first:
                 tasks[stage] = progress.add_task(stage, total=total)
             if not console.is_terminal and (first or due):
-                console.print(f"{stage}: {total:,}" if first else f"{stage}: {done:,}/{total:,}", soft_wrap=True)
+                console.print(f"{stage}: {total:,}" if first else f"{stage}: {done:,}/{total:,}")
                 shown = time.perf_counter()
             progress.update(tasks[stage], completed=done)
 

@@ -41,16 +41,17 @@ COMMANDS: dict[str, Callable[..., Callable[[Console], None]]] = {
 class OutputConsole(Console):
     """The console of all output: names from photos and files cannot control the terminal, nor look like other text.
 
-    It takes brackets as they are, since paths may have them. It raises BrokenPipeError when nobody reads its output any
-    more; rich's own exits with 1.
+    It takes brackets as they are, since paths may have them, and breaks no line of text, which may be a path or a
+    command to copy. It raises BrokenPipeError when nobody reads its output any more; rich's own exits with 1.
     """
 
     def __init__(self) -> None:
-        super().__init__(markup=False)
+        super().__init__(markup=False, highlight=False)
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print text with what does not print escaped, or a table."""
-        super().print(*(printable(x) if isinstance(x, str) else x for x in objects), **options)
+        text = all(isinstance(x, str) for x in objects)
+        super().print(*(printable(x) if isinstance(x, str) else x for x in objects), soft_wrap=text, **options)
 
     def on_broken_pipe(self) -> NoReturn:
         """Raise the error that is being handled."""

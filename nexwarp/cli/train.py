@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 
 from nexwarp.cli import display
-from nexwarp.cli.commands import make_scene, needs_cameras, print_url, scene_folder_of, show_until_interrupted
+from nexwarp.cli.commands import make_scene, needs_cameras, scene_folder_of, show_until_interrupted
 from nexwarp.cli.display import device_name
 from nexwarp.cli.options import Device_, Host_, Port_, Preset_, joined_ranks
 from nexwarp.cli.session import Session
@@ -148,12 +148,12 @@ class Train:
                 if after > before:
                     text = "learning rates, density control and all other schedules are those of a run of that length"
                     text = f"extended from {before:,} to {after:,} iterations: from here on, {text}"
-                    console.print(text, soft_wrap=True)
+                    console.print(text)
                 update_run(run, record)
             elif ranks.first:
                 check_teachers_place(run, record.own.count)
             if self.resume and not resume:
-                console.print(f"{run}: no checkpoint yet, training starts from the beginning", soft_wrap=True)
+                console.print(f"{run}: no checkpoint yet, training starts from the beginning")
             with self._viewer(runner, scene, record, run, console) if ranks.first else nullcontext() as viewer:
                 if not resume and ranks.first and (foreign := create_run(run, record)):
                     kept = f"{foreign[0]} and {len(foreign) - 1} more" if len(foreign) > 1 else foreign[0]
@@ -164,7 +164,7 @@ class Train:
                 quoted = shlex.quote(str(run))
                 show = f"nexwarp view {quoted} (in the browser)"
                 share = f"nexwarp export {quoted} --format web (a page to share)"
-                console.print(f"next: {show}, {share}", soft_wrap=True, markup=False, highlight=False)
+                console.print(f"next: {show}, {share}")
                 claim.close()  # while the viewer shows the result, other commands may write to the run
                 ranks.close()
                 if viewer is not None:
@@ -300,7 +300,7 @@ class Train:
             ),
             save_path=partial(keep_camera_path, run, origin=scene.train[0].camera.origin),
         )
-        print_url(viewer, console)
+        console.print(f"viewer: {viewer.url}")
         return viewer
 
 
