@@ -3,6 +3,7 @@
 Arguments of Python functions that are out of range or of another type raise plain ValueError and TypeError.
 """
 
+import importlib.util
 import os
 from collections.abc import Mapping
 
@@ -71,6 +72,13 @@ class OutOfMemoryError(NexwarpError, MemoryError):
         """Return the error of a rendering that does not fit."""
         advice = "render a smaller image, with a lower K, or in parts (Camera.crop)"
         return cls(f"out of memory: {task} needs {needed}; {advice}", needed)
+
+
+def check_package(needed_for: str, package: str, extra: str) -> None:
+    """Raise SettingError unless a package, of an extra of nexwarp, is installed."""
+    if importlib.util.find_spec(package) is None:
+        found = f"needs the package {package}, found none; pip install 'nexwarp[{extra}]'"
+        raise SettingError(f"{needed_for}: {found}")
 
 
 def check_tensors(

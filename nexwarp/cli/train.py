@@ -20,7 +20,7 @@ from nexwarp.cli.session import Session
 from nexwarp.data import Scene
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import DEMO, SceneSource
-from nexwarp.errors import SettingError
+from nexwarp.errors import SettingError, check_package
 from nexwarp.io.json_files import Json
 from nexwarp.model.model_file import load
 from nexwarp.model.surfels import Surfels
@@ -34,7 +34,6 @@ from nexwarp.run.folder import (
     read_run,
     update_run,
 )
-from nexwarp.run.log import check_tensorboard
 from nexwarp.train.initial import Start, check_start
 from nexwarp.train.ranks.ranks import Ranks, check_count, is_rank
 from nexwarp.train.recipe import DEMO_SETTINGS, Config, parse_settings, preset, setting, with_settings
@@ -265,7 +264,7 @@ class Train:
         if self.checkpoint_every is not None and self.checkpoint_every < 1:
             raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
         if self.tensorboard:
-            check_tensorboard()
+            check_package("--tensorboard", "tensorboard", "tensorboard")
         if self.view:
             from nexwarp.viewer import check_server
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import torch
 
-from nexwarp.errors import FormatError, SettingError, check_range
+from nexwarp.errors import FormatError, SettingError, check_package, check_range
 from nexwarp.io.files import one_line, written_aside
 
 if TYPE_CHECKING:
@@ -47,10 +47,7 @@ def check_video(path: str | os.PathLike[str], fps: float) -> None:
 
 def check_av(path: str | os.PathLike[str]) -> None:
     """Raise SettingError unless PyAV is installed; `path` is the video that needs it."""
-    try:
-        import av  # noqa: F401
-    except ImportError:
-        raise SettingError(f"{path}: videos need PyAV, which is not installed: pip install 'nexwarp[video]'") from None
+    check_package(str(path), "av", "video")
 
 
 @contextmanager

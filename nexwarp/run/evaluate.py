@@ -1,6 +1,5 @@
 """Evaluation on held-out views, with metrics computed from 8-bit images to be comparable with published numbers."""
 
-import importlib.util
 import os
 import warnings
 from collections.abc import Callable, Sequence
@@ -15,7 +14,7 @@ from safetensors.torch import load_file
 from torch.nn.functional import conv2d, max_pool2d, normalize
 
 from nexwarp.data import View
-from nexwarp.errors import FormatError, MissingError, SettingError
+from nexwarp.errors import FormatError, MissingError, SettingError, check_package
 from nexwarp.io.files import check_tensors_header, one_line
 from nexwarp.io.pictures import error_map, png_files, side_by_side, to_uint8
 from nexwarp.model.model import Model
@@ -185,10 +184,8 @@ def check_metrics(metrics: Sequence[str], device: torch.device) -> None:
     for name in metrics:
         if name not in METRICS:
             raise SettingError(f"metrics: expected some of {', '.join(METRICS)}, got {name!r}")
-    if "flip" in metrics and importlib.util.find_spec("flip_evaluator") is None:
-        raise SettingError(
-            "--metrics: flip needs the package flip-evaluator, which is not installed: pip install 'nexwarp[flip]'"
-        )
+    if "flip" in metrics:
+        check_package("--metrics: flip", "flip_evaluator", "flip")
     if "lpips" in metrics:
         try:
             load_vgg(weights_file(), device)

@@ -1,6 +1,5 @@
 """Export of run folders to the formats of other programs."""
 
-import importlib.util
 import re
 import warnings
 from collections.abc import Callable, Sequence
@@ -21,7 +20,7 @@ from nexwarp.data.images import image_size
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import DEMO, SceneSource, demo_folder, parse_color
 from nexwarp.data.transforms import lens_keys
-from nexwarp.errors import OutOfMemoryError, RunError, SettingError
+from nexwarp.errors import OutOfMemoryError, RunError, SettingError, check_package
 from nexwarp.export.bake import Progress
 from nexwarp.export.baked_scene import GLB, BakedScene, load_baked
 from nexwarp.export.fit import Views
@@ -131,10 +130,8 @@ class ExportOrder:
         parse_color(self.background)
         if self.annotations is not None:
             read_notes(self.annotations)
-        package, extra = PACKAGES.get(self.format, ("torch", ""))
-        if importlib.util.find_spec(package) is None:
-            need = f"--format {self.format}: needs the package {package}, found none"
-            raise SettingError(f"{need}; pip install 'nexwarp[{extra}]'")
+        if self.format in PACKAGES:
+            check_package(f"--format {self.format}", *PACKAGES[self.format])
 
 
 def export_run(

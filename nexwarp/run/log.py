@@ -1,6 +1,5 @@
 """Training logs: lines of JSON at regular iterations and, on request, TensorBoard."""
 
-import importlib.util
 import json
 import math
 import os
@@ -12,7 +11,6 @@ from typing import Any, TextIO
 
 import torch
 
-from nexwarp.errors import SettingError
 from nexwarp.io.files import written_aside
 from nexwarp.io.json_files import Json
 from nexwarp.run.folder import LOG_FILE, TENSORBOARD_FOLDER
@@ -154,11 +152,3 @@ def _scalars(line: Mapping[str, Json]) -> dict[str, float]:
     if isinstance(line["memory_bytes"], int):
         tags["memory/GiB"] = line["memory_bytes"] / 2**30
     return {name: value for name, value in tags.items() if isinstance(value, (int, float))}
-
-
-def check_tensorboard() -> None:
-    """Raise SettingError unless the package of `--tensorboard` is installed."""
-    if importlib.util.find_spec("tensorboard") is None:
-        raise SettingError(
-            "--tensorboard: expected the package tensorboard, found none; pip install 'nexwarp[tensorboard]'"
-        )

@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import importlib.util
 import io
 import logging
 import math
@@ -19,6 +18,7 @@ import torch
 
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import surrounding
+from nexwarp.errors import check_package
 from nexwarp.io.files import one_line
 from nexwarp.model.model import Model
 from nexwarp.viewer import pacing
@@ -325,8 +325,7 @@ def check_server(host: str, port: int) -> str:
 
     ValueError: viser is missing, or the address cannot be used; viser itself would try other ports.
     """
-    if importlib.util.find_spec("viser") is None:
-        raise ValueError("the viewer needs the package viser, found none; pip install 'nexwarp[viewer]'")
+    check_package("the viewer", "viser", "viewer")
     if not 0 <= port <= 65535:
         raise ValueError(f"--port: expected 0 to 65535, got {port}")
     try:
