@@ -5,7 +5,8 @@ Arguments of Python functions that are out of range or of another type raise pla
 
 import importlib.util
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 import torch
 
@@ -74,11 +75,25 @@ class OutOfMemoryError(NexwarpError, MemoryError):
         return cls(f"out of memory: {task} needs {needed}; {advice}", needed)
 
 
+def require(met: bool, message: str) -> None:
+    """Raise SettingError unless a condition on options is met."""
+    if not met:
+        raise SettingError(message)
+
+
+@contextmanager
+def naming(option: str) -> Iterator[None]:
+    """Raise a ValueError of the block as a SettingError that names an option."""
+    try:
+        yield
+    except ValueError as error:
+        raise SettingError(f"{option}: {error}") from None
+
+
 def check_package(needed_for: str, package: str, extra: str) -> None:
     """Raise SettingError unless a package, of an extra of nexwarp, is installed."""
-    if importlib.util.find_spec(package) is None:
-        found = f"needs the package {package}, found none; pip install 'nexwarp[{extra}]'"
-        raise SettingError(f"{needed_for}: {found}")
+    found = importlib.util.find_spec(package) is not None
+    require(found, f"{needed_for}: needs the package {package}, found none; pip install 'nexwarp[{extra}]'")
 
 
 def check_tensors(

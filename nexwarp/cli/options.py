@@ -12,7 +12,7 @@ import warp as wp
 
 from nexwarp.cli import __version__
 from nexwarp.data.option import option
-from nexwarp.errors import RankError, SettingError
+from nexwarp.errors import RankError, SettingError, require
 from nexwarp.kernels.launch import get_num_threads, set_num_threads
 from nexwarp.train.ranks.ranks import Ranks, is_rank
 
@@ -25,11 +25,10 @@ Host_ = Annotated[str, option("ADDRESS")]
 
 def pick_device(name: str | None) -> torch.device:
     """Return the device of this name; None selects CUDA if available, else the CPU. SettingError if there is none."""
-    if name not in (None, "cuda", "cpu"):
-        raise SettingError(f"--device: expected cuda or cpu, got {name!r}")
+    require(name in (None, "cuda", "cpu"), f"--device: expected cuda or cpu, got {name!r}")
     available = torch.cuda.is_available()
-    if name == "cuda" and not available:
-        raise SettingError("--device: expected a CUDA device, but torch finds no CUDA device; use --device cpu")
+    missing = "--device: expected a CUDA device, but torch finds no CUDA device; use --device cpu"
+    require(available or name != "cuda", missing)
     if name == "cpu" or not available:
         return torch.device("cpu")
     return torch.device("cuda", torch.cuda.current_device())

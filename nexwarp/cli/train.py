@@ -2,8 +2,7 @@
 
 import dataclasses
 import shlex
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from nexwarp.cli.session import Session
 from nexwarp.data import Scene
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import DEMO, SceneSource
-from nexwarp.errors import SettingError, check_package
+from nexwarp.errors import SettingError, check_package, naming, require
 from nexwarp.io.json_files import Json
 from nexwarp.model.model_file import load
 from nexwarp.model.surfels import Surfels
@@ -124,14 +123,13 @@ class Train:
                 is_ply = record.init.suffix == PLY
                 start = {"surfels": Surfels.load(record.init)} if is_ply else {"init": load(record.init)}
             scene = _load_scene(record, ranks, console)
-            with _naming("--init"):
+            with naming("--init"):
                 check_start(scene, record.config, start)
             if not resume:
                 config = record.config
                 if scene.background is not None:
-                    if "background" in parse_settings(self.settings):
-                        expected = "expected --background instead, which also applies to the photos"
-                        raise SettingError(f"--set: background: {expected}")
+                    expected = "expected --background instead, which also applies to the photos"
+                    require("background" not in parse_settings(self.settings), f"--set: background: {expected}")
                     config = dataclasses.replace(config, background=scene.background)
                 config = shortened(config, len(scene.train))
                 own = NO_TEACHERS if teachers else plan_teachers(config, len(scene.train))
@@ -210,7 +208,7 @@ class Train:
         if self.iterations is not None:
             base = dataclasses.replace(base, steps_a_photo=None)
         base = with_settings(base, flags)
-        with _naming("--set"):
+        with naming("--set"):
             return with_settings(base, settings)
 
     def _settings(self) -> tuple[dict[str, Json], dict[str, Json]]:
@@ -224,11 +222,10 @@ class Train:
             "refine_poses": self.refine_poses or None,
         }
         flags = {name: value for name, value in flags.items() if value is not None}
-        with _naming("--set"):
+        with naming("--set"):
             settings = parse_settings(self.settings)
         for name in settings:
-            if name == "preset" or name in flags:
-                raise SettingError(f"--set: {name}: expected {_flag(name)} instead of --set")
+            require(name not in ("preset", *flags), f"--set: {name}: expected {_flag(name)} instead of --set")
         return flags, settings
 
     def _resumed(self, old: RunRecord) -> RunRecord:
@@ -243,7 +240,7 @@ class Train:
             _check_same("--preset", old.config.preset, self.preset)
         config = old.config
         changed = with_settings(config, flags)
-        with _naming("--set"):
+        with naming("--set"):
             changed = with_settings(changed, settings)
         for name in (*flags, *settings):
             value = setting(changed, name)
@@ -261,8 +258,8 @@ class Train:
 
     def _check(self) -> None:
         """Raise SettingError for invalid options, before the photos are read."""
-        if self.checkpoint_every is not None and self.checkpoint_every < 1:
-            raise SettingError(f"--checkpoint-every: expected at least 1, got {self.checkpoint_every}")
+        every = self.checkpoint_every
+        require(every is None or every >= 1, f"--checkpoint-every: expected at least 1, got {every}")
         if self.tensorboard:
             check_package("--tensorboard", "tensorboard", "tensorboard")
         if self.view:
@@ -309,17 +306,7 @@ def _flag(name: str) -> str:
 
 def _check_same(what: str, expected: object, given: object) -> None:
     """Raise SettingError unless an option is that of the run to resume."""
-    if given != expected:
-        raise SettingError(f"{what}: expected {expected} as in the run to resume, got {given}")
-
-
-@contextmanager
-def _naming(flag: str) -> Iterator[None]:
-    """Raise a ValueError of the block as a SettingError that names an option."""
-    try:
-        yield
-    except ValueError as error:
-        raise SettingError(f"{flag}: {error}") from None
+    require(given == expected, f"{what}: expected {expected} as in the run to resume, got {given}")
 
 
 def _load_scene(record: RunRecord, ranks: Ranks, console: Console) -> Scene:

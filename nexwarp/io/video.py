@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import torch
 
-from nexwarp.errors import FormatError, SettingError, check_package, check_range
+from nexwarp.errors import FormatError, check_package, check_range, require
 from nexwarp.io.files import one_line, written_aside
 
 if TYPE_CHECKING:
@@ -38,10 +38,9 @@ LARGEST_FRAME = 40_000_000  # pixels; 8K has 33 million
 def check_video(path: str | os.PathLike[str], fps: float) -> None:
     """Raise SettingError unless the suffix of `path` and `fps` are valid for a video and PyAV is installed."""
     suffix = Path(path).suffix.lower()
-    if suffix not in KINDS:
-        raise SettingError(f"{path}: expected a video ending in {', '.join(KINDS)}, got {suffix or 'no suffix'}")
-    if not 0 < fps <= FASTEST:
-        raise SettingError(f"fps: expected more than 0 and at most {FASTEST:g} frames a second, got {fps:g}")
+    known = ", ".join(KINDS)
+    require(suffix in KINDS, f"{path}: expected a video ending in {known}, got {suffix or 'no suffix'}")
+    require(0 < fps <= FASTEST, f"fps: expected more than 0 and at most {FASTEST:g} frames a second, got {fps:g}")
     check_av(path)
 
 

@@ -12,7 +12,7 @@ import torch
 from nexwarp.cameras.paths import focus_ahead, subject
 from nexwarp.cameras.similarity import Similarity, upright
 from nexwarp.data.option import Flag_, option
-from nexwarp.errors import RunError, SettingError
+from nexwarp.errors import RunError, naming, require
 from nexwarp.export.bake import Progress
 from nexwarp.model.crop import REGIONS
 from nexwarp.model.edit import REMOVE, Edit, checksum, moved_surfels, write_edits
@@ -51,13 +51,10 @@ class EditOrder:
     def check(self) -> None:
         """Raise SettingError unless there is at most one operation, with numbers that fit."""
         asked = [name for name, value in vars(self).items() if value is not None and value is not False]
-        if len(asked) > 1:
-            names = ", ".join(f"--{name.replace('_', '-')}" for name in asked)
-            raise SettingError(f"{names}: expected one operation at a time, got {len(asked)}")
-        try:
+        names = ", ".join(f"--{name.replace('_', '-')}" for name in asked)
+        require(len(asked) <= 1, f"{names}: expected one operation at a time, got {len(asked)}")
+        with naming(names):
             self._given()
-        except ValueError as error:
-            raise SettingError(f"--{asked[0].replace('_', '-')}: {error}") from None
 
     def _given(self) -> Edit | None:
         """Return the edit that the options give alone, whatever the scene; ValueError where its numbers do not fit."""

@@ -14,7 +14,7 @@ from safetensors.torch import load_file
 from torch.nn.functional import conv2d, max_pool2d, normalize
 
 from nexwarp.data import View
-from nexwarp.errors import FormatError, MissingError, SettingError, check_package
+from nexwarp.errors import FormatError, MissingError, SettingError, check_package, require
 from nexwarp.io.files import check_tensors_header, one_line
 from nexwarp.io.pictures import error_map, png_files, side_by_side, to_uint8
 from nexwarp.model.model import Model
@@ -182,8 +182,7 @@ METRICS = {"psnr": psnr, "ssim": ssim, "flip": flip, "lpips": lpips_vgg}
 def check_metrics(metrics: Sequence[str], device: torch.device) -> None:
     """Raise SettingError unless metrics are known, and their packages and weights are there."""
     for name in metrics:
-        if name not in METRICS:
-            raise SettingError(f"metrics: expected some of {', '.join(METRICS)}, got {name!r}")
+        require(name in METRICS, f"metrics: expected some of {', '.join(METRICS)}, got {name!r}")
     if "flip" in metrics:
         check_package("--metrics: flip", "flip_evaluator", "flip")
     if "lpips" in metrics:

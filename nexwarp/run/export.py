@@ -20,7 +20,7 @@ from nexwarp.data.images import image_size
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import DEMO, SceneSource, demo_folder, parse_color
 from nexwarp.data.transforms import lens_keys
-from nexwarp.errors import OutOfMemoryError, RunError, SettingError, check_package
+from nexwarp.errors import OutOfMemoryError, RunError, SettingError, check_package, require
 from nexwarp.export.bake import Progress
 from nexwarp.export.baked_scene import GLB, BakedScene, load_baked
 from nexwarp.export.fit import Views
@@ -113,20 +113,18 @@ class ExportOrder:
 
     def check(self) -> None:
         """Raise SettingError unless the options fit together."""
-        if not self.max_extent > 0:
-            raise SettingError(f"--max-extent: expected more than 0, got {self.max_extent:g}")
-        if self.noise is not None and not NOISES[0] <= self.noise <= NOISES[1]:
-            raise SettingError(f"--noise: expected {NOISES[0]:g} to {NOISES[1]:g}, got {self.noise:g}")
-        if self.format not in EXPORTS:
-            raise SettingError(f"--format: expected one of {', '.join(EXPORTS)}, got {self.format!r}")
-        if self.alpha not in ALPHAS:
-            raise SettingError(f"--alpha: expected {' or '.join(ALPHAS)}, got {self.alpha!r}")
+        least, most = NOISES
+        noise = least if self.noise is None else self.noise
+        require(self.max_extent > 0, f"--max-extent: expected more than 0, got {self.max_extent:g}")
+        require(least <= noise <= most, f"--noise: expected {least:g} to {most:g}, got {noise:g}")
+        require(self.format in EXPORTS, f"--format: expected one of {', '.join(EXPORTS)}, got {self.format!r}")
+        require(self.alpha in ALPHAS, f"--alpha: expected {' or '.join(ALPHAS)}, got {self.alpha!r}")
         for kind, names in OPTIONS.items():
             asked = [f"--{name}" for name in names if (x := getattr(self, name)) is not None and x not in ("", False)]
             if asked and self.format != kind:
                 raise SettingError(f"{asked[0]}: expected together with --format {kind}, got --format {self.format}")
-        if not re.fullmatch(r"(https?://[^\s/]+\S*)?", self.url):
-            raise SettingError(f"--url: expected an address that begins with https://, got {self.url!r:.60}")
+        is_address = re.fullmatch(r"(https?://[^\s/]+\S*)?", self.url) is not None
+        require(is_address, f"--url: expected an address that begins with https://, got {self.url!r:.60}")
         parse_color(self.background)
         if self.annotations is not None:
             read_notes(self.annotations)

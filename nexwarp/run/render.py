@@ -18,9 +18,9 @@ from nexwarp.cameras.paths import PATHS, suited_path
 from nexwarp.cameras.ray_camera import MAX_SIDE, RayCamera
 from nexwarp.cameras.similarity import IDENTITY, Similarity
 from nexwarp.data.option import Flag_, option
-from nexwarp.errors import RunError, SettingError
+from nexwarp.errors import RunError, SettingError, naming, require
 from nexwarp.io.pictures import linear_light, png_files, save_exr, to_uint8
-from nexwarp.io.video import check_video, video_writer
+from nexwarp.io.video import FASTEST, check_video, video_writer
 from nexwarp.model.buffers import render_buffers, save_buffers
 from nexwarp.model.edit import moved_buffers
 from nexwarp.model.model import Model
@@ -30,7 +30,7 @@ from nexwarp.run.folder import FILE_PATH, RENDERS_FOLDER, TEST, TRAIN, OpenedMod
 
 FRAMES = 120
 FPS = 30.0
-PINHOLE = "pinhole"
+PROJECTIONS = (PINHOLE, PANORAMA, FISHEYE) = ("pinhole", "panorama", "fisheye")
 SETS = {"test": (TEST,), "train": (TRAIN,), "all": (TRAIN, TEST), None: ()}
 LARGEST_SIDE = 16384  # pixels
 
@@ -79,48 +79,34 @@ class RenderOrder:
 
     def check(self) -> None:
         """Raise SettingError unless the options fit together."""
-        kinds = (PINHOLE, "panorama", "fisheye")
-        checks = [
-            (self.set not in SETS, f"--set: expected test, train or all, got {self.set!r}"),
-            (
-                self.path is not None and self.path not in PATHS and not self.path.lower().endswith(".json"),
-                f"--path: expected {', '.join(PATHS)} or a file ending in .json, got {self.path!r}",
-            ),
-            (self.frames is not None and self.frames < 0, f"--frames: expected at least 0, got {self.frames}"),
-            (
-                self.frames == 0 and (self.video is not None or self.views is None),
-                "--frames: expected at least 1 for a path or a video, got 0",
-            ),
-            (
-                not self.has_path and bool(self.frames),
-                "--frames: expected together with --path or --video, got --set alone",
-            ),
-            (self.fps is not None and self.video is None, "--fps: expected together with --video, got no --video"),
-            (self.format not in ("png", "exr"), f"--format: expected png or exr, got {self.format!r}"),
-            (self.buffers and self.format != "png", "--buffers: expected together with --format png, got exr"),
-            (self.camera not in kinds, f"--camera: expected {', '.join(kinds)}, got {self.camera!r}"),
-            (not 1 <= self.fov <= 360, f"--fov: expected 1 to 360 degrees, got {self.fov:g}"),
-            (
-                self.fov != 180.0 and self.camera != "fisheye",
-                f"--fov: expected together with --camera fisheye, got --camera {self.camera}",
-            ),
-        ]
+        is_path = self.path is None or self.path in PATHS or self.path.lower().endswith(".json")
+        needs_frames = self.video is not None or self.views is None
+        fps = FPS if self.fps is None else self.fps
+        require(self.set in SETS, f"--set: expected test, train or all, got {self.set!r}")
+        require(is_path, f"--path: expected {', '.join(PATHS)} or a file ending in .json, got {self.path!r}")
+        require(self.frames is None or self.frames >= 0, f"--frames: expected at least 0, got {self.frames}")
+        require(self.frames != 0 or not needs_frames, "--frames: expected at least 1 for a path or a video, got 0")
+        alone = "--frames: expected together with --path or --video, got --set alone"
+        require(self.has_path or not self.frames, alone)
+        require(self.fps is None or self.video is not None, "--fps: expected together with --video, got no --video")
+        require(0 < fps <= FASTEST, f"--fps: expected more than 0 and at most {FASTEST:g} frames a second, got {fps:g}")
+        require(self.format in ("png", "exr"), f"--format: expected png or exr, got {self.format!r}")
+        drawn = "--buffers: expected together with --format png, got exr"
+        require(self.format == "png" or not self.buffers, drawn)
+        require(self.camera in PROJECTIONS, f"--camera: expected {', '.join(PROJECTIONS)}, got {self.camera!r}")
+        require(1 <= self.fov <= 360, f"--fov: expected 1 to 360 degrees, got {self.fov:g}")
+        fisheye = f"--fov: expected together with --camera fisheye, got --camera {self.camera}"
+        require(self.fov == 180.0 or self.camera == FISHEYE, fisheye)
         for name, value, kind in (("exposure", self.exposure, Exposure), ("order", self.order, Order)):
             known = get_args(kind)
-            checks.append((value not in (None, *known), f"--{name}: expected {' or '.join(known)}, got {value!r}"))
+            require(value in (None, *known), f"--{name}: expected {' or '.join(known)}, got {value!r}")
         for name, asked in (("order", self.order is not None), ("buffers", self.buffers)):
-            message = f"--{name}: expected together with --camera pinhole, got --camera {self.camera}"
-            checks.append((asked and self.camera != PINHOLE, message))
-        for wrong, message in checks:
-            if wrong:
-                raise SettingError(message)
+            pinhole = f"--{name}: expected together with --camera pinhole, got --camera {self.camera}"
+            require(self.camera == PINHOLE or not asked, pinhole)
         self._size()
         if self.video is not None:
-            try:
-                check_video(self.video, FPS if self.fps is None else self.fps)
-            except ValueError as error:
-                flag = "--fps" if str(error).startswith("fps: ") else "--video"
-                raise SettingError(f"{flag}: {str(error).removeprefix('fps: ')}") from None
+            with naming("--video"):
+                check_video(self.video, fps)
 
     @property
     def has_path(self) -> bool:
@@ -184,33 +170,30 @@ class RenderOrder:
 
     def _size(self) -> Callable[[Camera], Camera]:
         """Return the function that resizes a camera's image as --size or --scale specify."""
-        if not 0 < self.scale < math.inf:
-            raise SettingError(f"--scale: expected a number above 0, got {self.scale:g}")
+        require(0 < self.scale < math.inf, f"--scale: expected a number above 0, got {self.scale:g}")
         if self.size is None:
             return self._scaled
-        if self.scale != 1.0:
-            raise SettingError("--size, --scale: expected at most one of them, got both")
+        require(self.scale == 1.0, "--size, --scale: expected at most one of them, got both")
         match = re.fullmatch(r"(\d+)[xX](\d+)", self.size)
-        sides = tuple(int(side) for side in match.groups()) if match else ()
-        if not sides or not all(1 <= side <= LARGEST_SIDE for side in sides):
-            raise SettingError(f"--size: expected WIDTHxHEIGHT of 1 to {LARGEST_SIDE} pixels each, got {self.size!r}")
-        return lambda camera: resized(camera, sides[0], sides[1])
+        width, height = map(int, match.groups()) if match else (0, 0)
+        fits = 1 <= min(width, height) and max(width, height) <= LARGEST_SIDE
+        require(fits, f"--size: expected WIDTHxHEIGHT of 1 to {LARGEST_SIDE} pixels each, got {self.size!r}")
+        return lambda camera: resized(camera, width, height)
 
     def _scaled(self, camera: Camera) -> Camera:
         """Resize an image by --scale; a panorama's pixels are as large as the photos', a fisheye image is a square."""
         width = camera.width
         height = camera.height
-        if self.camera == "panorama":
+        if self.camera == PANORAMA:
             height = max(min(round(math.pi * camera.focal), MAX_SIDE // 2), 2)
             width = 2 * height
-        elif self.camera == "fisheye":
+        elif self.camera == FISHEYE:
             width = height
         camera = dataclasses.replace(camera, width=width, height=height)
         width, height = (max(round(side * self.scale), 1) for side in (width, height))
-        if max(width, height) > LARGEST_SIDE:
-            raise SettingError(
-                f"--scale: expected at most {LARGEST_SIDE} pixels a side, got {width}x{height} with {self.scale:g}"
-            )
+        got = f"{width}x{height} with {self.scale:g}"
+        fits = max(width, height) <= LARGEST_SIDE
+        require(fits, f"--scale: expected at most {LARGEST_SIDE} pixels a side, got {got}")
         return resized(camera, width, height)
 
 
@@ -271,9 +254,9 @@ def projected(order: RenderOrder, camera: Camera) -> Camera | RayCamera:
     """Return the camera of an order's projection, at the pose of a pinhole of the picture's size."""
     viewmat = camera.viewmat.float()
     size = (camera.width, camera.height)
-    if order.camera == "panorama":
+    if order.camera == PANORAMA:
         return RayCamera.panorama(viewmat, *size, near=camera.near)
-    if order.camera == "fisheye":
+    if order.camera == FISHEYE:
         focal = min(size) / math.radians(order.fov)
         K = torch.tensor([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])
         return RayCamera.fisheye(viewmat, K.to(viewmat), (0, 0, 0, 0), *size, near=camera.near)
