@@ -162,6 +162,20 @@ def check_version(value: object, known: int) -> None:
         raise ValueError(f"expected format version {expected}, got {value!r:.60}{reason}")
 
 
+def check_integer(name: str, value: object, low: float, high: float = float("inf")) -> None:
+    """Raise TypeError unless a value is an int, and ValueError unless low <= value <= high."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
+    check_range(name, value, low, high)
+
+
+def check_number(name: str, value: object, low: float, high: float = float("inf")) -> None:
+    """Raise TypeError unless a value is an int or float, and ValueError unless low <= value <= high."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+    check_range(name, value, low, high)
+
+
 def check_range(name: str, value: float, low: float, high: float = float("inf")) -> None:
     """Raise ValueError unless low <= value <= high."""
     if not low <= value <= high:

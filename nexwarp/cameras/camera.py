@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import torch
 
-from nexwarp.errors import check_finite, check_range, check_tensors
+from nexwarp.errors import check_finite, check_integer, check_number, check_range, check_tensors
 
 Array: TypeAlias = torch.Tensor | np.ndarray
 
@@ -80,7 +80,7 @@ class Camera:
             viewmat = _as_tensor("viewmat", self.viewmat, None)
             K = _as_tensor("K", self.K, viewmat.device)
             vars(self).update(viewmat=viewmat, K=K)
-            checked = _check(viewmat, K, {"width": self.width, "height": self.height}, self.near)
+            checked = _check(self)
         vars(self).update(zip(("fx", "fy", "cx", "cy"), checked, strict=True))
 
     @property
@@ -198,22 +198,17 @@ def _as_tensor(name: str, value: object, device: torch.device | None) -> torch.T
     return torch.tensor(numbers, dtype=torch.float32, device=device)
 
 
-def _check(
-    viewmat: torch.Tensor, K: torch.Tensor, sides: dict[str, int], near: float
-) -> tuple[float, float, float, float]:
+def _check(camera: Camera) -> tuple[float, float, float, float]:
     """Return fx, fy, cx and cy; raise TypeError or ValueError where a field of a camera does not fit."""
+    viewmat, K = camera.viewmat, camera.K
     check_tensors({"viewmat": (viewmat, (4, 4))})
     check_tensors({"K": (K, (3, 3))}, device=viewmat.device)
     pose, intrinsics = viewmat.detach().double().cpu(), K.detach().double().cpu()
     check_finite("viewmat", pose)
     check_finite("K", intrinsics)
-    for name, value in sides.items():
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
-        check_range(name, value, 1)
-    if isinstance(near, bool) or not isinstance(near, (int, float)):
-        raise TypeError(f"near: expected a number, got {type(near).__name__}")
-    check_range("near", near, 0, LARGEST_DISTANCE)
+    check_integer("width", camera.width, 1)
+    check_integer("height", camera.height, 1)
+    check_number("near", camera.near, 0, LARGEST_DISTANCE)
     rotation, moved = pose[:3, :3], pose[:3, 3]
     error = (rotation.T @ rotation - torch.eye(3, dtype=pose.dtype)).abs().max().item()
     last_row = (pose[3] - pose.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().max()

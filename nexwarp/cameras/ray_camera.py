@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import LARGEST_DISTANCE, Camera
-from nexwarp.errors import check_finite, check_range, check_tensors
+from nexwarp.errors import check_finite, check_integer, check_range, check_tensors
 
 MAX_SIDE = 32768  # pixels
 MAX_PARAMETER = 1e3  # of a fisheye lens
@@ -42,8 +42,8 @@ class RayCamera:
     def __post_init__(self) -> None:
         check_tensors({"viewmat": (self.viewmat, (4, 4)), "rays": (self.rays, ("H", "W", 3))})
         height, width, _ = self.rays.shape
-        for name, side in (("width", width), ("height", height)):
-            check_range(name, side, 1, MAX_SIDE)
+        check_range("width", width, 1, MAX_SIDE)
+        check_range("height", height, 1, MAX_SIDE)
         check_range("near", self.near, 0, LARGEST_DISTANCE)
         check_range("focal", self.focal, 1e-16, MAX_SIDE / 2)
         # The pose is checked as that of any camera.
@@ -92,7 +92,9 @@ class RayCamera:
             height: pixels from top to bottom; None is half the width.
             near: hits no farther than this are ignored, world units.
         """
-        height = _side("width", width, 4) // 2 if height is None else _side("height", height, 1)
+        check_integer("width", width, 4, MAX_SIDE)
+        height = width // 2 if height is None else height
+        check_integer("height", height, 1, MAX_SIDE)
         x, y = _pixel_centers(width, height)
         longitude, latitude = (x / width - 0.5) * 2 * math.pi, (y / height - 0.5) * math.pi
         across = latitude.cos()
@@ -124,7 +126,9 @@ class RayCamera:
             near: hits no farther than this are ignored, world units.
             max_angle: largest angle to the optical axis, radians, at most pi.
         """
-        checked = Camera(viewmat, K, _side("width", width, 1), _side("height", height, 1), near)
+        check_integer("width", width, 1, MAX_SIDE)
+        check_integer("height", height, 1, MAX_SIDE)
+        checked = Camera(viewmat, K, width, height, near)
         terms = [float(k) for k in distortion]
         if len(terms) != 4:
             raise ValueError(f"distortion: expected k1, k2, k3 and k4, got {len(terms)} numbers")
@@ -138,13 +142,6 @@ class RayCamera:
         outward = angle.sin() / radius.clamp_min(1e-300)
         rays = torch.stack([x * outward, y * outward, angle.cos()], -1) * valid[..., None]
         return cls(viewmat, rays.to(viewmat), near, checked.focal)
-
-
-def _side(name: str, value: int, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
-    check_range(name, value, least, MAX_SIDE)
-    return value
 
 
 def _pixel_centers(width: int, height: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -11,7 +11,7 @@ from typing import cast
 import torch
 
 from nexwarp.cameras.cameras_file import origin_of
-from nexwarp.errors import FormatError, MissingError, check_finite, check_range, check_tensors, check_version
+from nexwarp.errors import FormatError, MissingError, check_finite, check_number, check_tensors, check_version
 from nexwarp.io.files import check_tensors_header, one_line, write_atomically
 from nexwarp.io.json_files import Json, parse_json
 from nexwarp.model.bounds import check_bounds, fits_half
@@ -51,7 +51,7 @@ def save_model(path: str | os.PathLike[str], model: Model, *, compact: bool | fl
 
     noise = NOISE if compact is True else float(compact)
     if compact:
-        check_range("compact", noise, *NOISES)
+        check_number("compact", noise, *NOISES)
     tensors = {f"surfels.{name}": x for name, x in model.surfels.state_dict().items()}
     shape = _texture_record(model.texture)
     for name, x in _stored_state(model.texture).items():
@@ -197,10 +197,7 @@ def _read_options(meta: dict[str, Json]) -> RenderOptions:
     origin_of(meta)
     for name in ("near", "scene_scale", "smooth_sh"):
         if name in meta:
-            value = meta[name]
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise ValueError(f"{name}: expected a number, got {value!r:.60}")
-            check_range(name, value, 0.0, LARGEST_LENGTH)
+            check_number(name, meta[name], 0.0, LARGEST_LENGTH)
     return RenderOptions(**values)  # type: ignore[arg-type]  # the constructor checks the types
 
 

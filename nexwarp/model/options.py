@@ -9,7 +9,7 @@ from typing import Any, Literal, TypedDict, cast, get_args
 import torch
 from typing_extensions import Unpack
 
-from nexwarp.errors import check_finite, check_range
+from nexwarp.errors import check_finite, check_integer, check_range
 from nexwarp.io.files import one_line
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.ops.tiles import Order, check_order
@@ -59,11 +59,8 @@ class RenderOptions:
     order: Order = "depth"
 
     def __post_init__(self) -> None:
-        for name, high in (("max_hits", MAX_HITS), ("sh_degree", MAX_SH_DEGREE)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise TypeError(f"{name}: expected an int, got {value!r:.60}")
-            check_range(name, value, 0, high)
+        check_integer("max_hits", self.max_hits, 0, MAX_HITS)
+        check_integer("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
         for name in ("clamp_texture", "detail_limits"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name}: expected True or False, got {getattr(self, name)!r:.60}")

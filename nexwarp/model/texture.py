@@ -15,7 +15,7 @@ from typing_extensions import Unpack
 
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
-from nexwarp.errors import check_range, check_tensors
+from nexwarp.errors import check_integer, check_number, check_tensors
 from nexwarp.kernels.types import MAX_SH_DEGREE
 from nexwarp.ops import fused_texture
 
@@ -188,13 +188,8 @@ class NeuralTexture(Texture):
         """
         super().__init__()
         check_sizes(levels, table_size, features, width, hidden_layers, sh_degree)
-        for name, value, low in (
-            ("min_resolution", min_resolution, 1e-30),
-            ("max_resolution", max_resolution, min_resolution),
-        ):
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
-            check_range(name, value, low, LARGEST_RESOLUTION)
+        check_number("min_resolution", min_resolution, 1e-30, LARGEST_RESOLUTION)
+        check_number("max_resolution", max_resolution, min_resolution, LARGEST_RESOLUTION)
         for name, flag in flags.items():
             if name not in TextureFlags.__annotations__ or not isinstance(flag, bool):
                 raise TypeError(f"{name}: expected residual or down_weighting, True or False, got {flag!r}")
@@ -352,17 +347,12 @@ def _geometric_series(first: float, last: float, count: int) -> torch.Tensor:
 
 def check_sizes(levels: int, table_size: int, features: int, width: int, hidden_layers: int, sh_degree: int) -> None:
     """Raise TypeError or ValueError unless each size is an int in its range."""
-    for name, value, low, high in (
-        ("levels", levels, 1, 64),
-        ("table_size", table_size, 1, 2**30),
-        ("features", features, 1, 8),
-        ("width", width, 1, 4096),
-        ("hidden_layers", hidden_layers, 0, 64),
-        ("sh_degree", sh_degree, 0, MAX_SH_DEGREE),
-    ):
-        if isinstance(value, bool) or not isinstance(value, int):
-            raise TypeError(f"{name}: expected an int, got {type(value).__name__}")
-        check_range(name, value, low, high)
+    check_integer("levels", levels, 1, 64)
+    check_integer("table_size", table_size, 1, 2**30)
+    check_integer("features", features, 1, 8)
+    check_integer("width", width, 1, 4096)
+    check_integer("hidden_layers", hidden_layers, 0, 64)
+    check_integer("sh_degree", sh_degree, 0, MAX_SH_DEGREE)
     if table_size & (table_size - 1):
         raise ValueError(f"table_size: expected a power of two, got {table_size}")
     if features not in (1, 2, 4, 8):
