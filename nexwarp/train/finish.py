@@ -28,7 +28,6 @@ from nexwarp.model.texture import NEVER, DetailLimits
 from nexwarp.train.recipe import Config
 from nexwarp.train.target import with_cameras
 
-PRODUCTS = 2**26  # values of the normal equations held at once, float64: 0.5 GiB
 SOLVED = 2**21  # values of the matrices solved at once, several times
 LEAST = 1e-6  # least sum of weights over all views, in pixels, of a surfel that is seen
 FinishObserver = Callable[[str, int, int], None]
@@ -97,7 +96,7 @@ def smooth_sh(
     """Return smoothed coefficients `sh0` (N, 1, 3) and `shN` (N, C - 1, 3); masked pixels do not count.
 
     A surfel that no view shows gets one colour for all directions, that of its `sh0`. Coefficients above the rendered
-    degree do not change. Each view is rendered once for every group of surfels whose equations are held at once.
+    degree do not change.
     """
     surfels = model.surfels
     sh0, shN = surfels.sh0.detach(), surfels.shN.detach()
@@ -106,17 +105,12 @@ def smooth_sh(
         return sh0.clone(), shN.clone()
     every = torch.cat([sh0, shN], dim=1)
     rendered = every[:, :count]
-    turns = torch.arange(len(surfels), device=surfels.device).split(PRODUCTS // (count * (count + 1) // 2))
-    for turn, ids in enumerate(turns):
-
-        def done(number: int, before: int = turn * len(views)) -> None:
-            progress(before + number, len(turns) * len(views))
-
-        products, total = seen_directions(model, views, ids, done)
-        for part in torch.arange(len(ids), device=surfels.device).split(SOLVED // count**2):
-            known = total[part] > LEAST
-            _smooth(rendered, ids[part[known]], products[part[known]] / total[part[known], None], strength)
-            rendered[ids[part[~known]], 1:] = 0.0
+    products, total = seen_directions(model, views, progress)
+    for ids in torch.arange(len(surfels), device=surfels.device).split(SOLVED // count**2):
+        known = total[ids] > LEAST
+        seen = ids[known]
+        _smooth(rendered, seen, products[seen] / total[seen, None], strength)
+        rendered[ids[~known], 1:] = 0.0
     return every[:, :1].contiguous(), every[:, 1:].contiguous()
 
 
@@ -136,9 +130,9 @@ def _smooth(coefficients: torch.Tensor, ids: torch.Tensor, equations: torch.Tens
 
 @torch.no_grad()
 def seen_directions(
-    model: Model, views: Sequence[View], ids: torch.Tensor, progress: Callable[[int], object] = lambda _: None
+    model: Model, views: Sequence[View], progress: Callable[[int, int], object] = lambda _, __: None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the normal equations of the surfels `ids` (M,): sum_v w_v Y_i(d_v) Y_j(d_v), (M, P), and sum_v w_v, (M,).
+    """Return the normal equations of the N surfels: sum_v w_v Y_i(d_v) Y_j(d_v), (N, P), and sum_v w_v, (N,).
 
     Of C coefficients there are P = C (C + 1) / 2 pairs i <= j, row by row of a matrix's upper triangle. Both are
     float64: the rounding of sums in float32 would exceed the term of a weak smoothing.
@@ -147,18 +141,18 @@ def seen_directions(
     surfels = bare.surfels
     count = _count(model)
     row, column = torch.triu_indices(count, count, device=surfels.device).unbind()
-    products = torch.zeros(len(ids), len(row), dtype=torch.float64, device=surfels.device)
-    total = products.new_zeros(len(ids))
+    products = torch.zeros(len(surfels), len(row), dtype=torch.float64, device=surfels.device)
+    total = products.new_zeros(len(surfels))
     for number, view in enumerate(views, 1):
         camera = view.camera.to(surfels.device)
         out = bare.render(camera)
         counts = torch.ones_like(out.alpha) if view.mask is None else view.mask.to(out.alpha)
-        weights = out.splat_error(counts)[ids].double()
+        weights = out.splat_error(counts).double()
         for seen in weights.nonzero()[:, 0].split(SOLVED // count**2):
-            basis = harmonics(surfels.means.detach()[ids[seen]], camera.position, count).double()
+            basis = harmonics(surfels.means.detach()[seen], camera.position, count).double()
             products[seen] += weights[seen, None] * basis[:, row] * basis[:, column]
         total += weights
-        progress(number)
+        progress(number, len(views))
     return products, total
 
 

@@ -52,7 +52,7 @@ def test_directions_count_by_the_weight_that_surfels_have_there(device: torch.de
     mask = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     mask[:, : SIDE // 2] = True
     views = [*around([0.0, 0.7]), view([0.5, -0.5, -4.0], mask)]
-    found, total = (x.float() for x in seen_directions(nw.Model(surfels, None), views, torch.arange(20, device=device)))
+    found, total = (x.float() for x in seen_directions(nw.Model(surfels, None), views))
     row, column = torch.triu_indices(16, 16)
     expected, expected_total = torch.zeros_like(found), torch.zeros_like(total)
     for v in views:
@@ -83,8 +83,7 @@ def test_coefficients_are_those_of_ridge_regression(device: torch.device, streng
     """A minimum of what the module's docstring says, by least squares over its terms, not by their normal equations."""
     surfels, views = blob(device), around([-0.6, -0.2, 0.1, 0.5])
     before = surfels.sh.detach().clone()
-    rows = torch.arange(len(surfels), device=device)
-    weights = torch.stack([seen_directions(nw.Model(surfels, None), [v], rows)[1][0] for v in views]).cpu()
+    weights = torch.stack([seen_directions(nw.Model(surfels, None), [v])[1][0] for v in views]).cpu()
     directions = torch.stack([-v.camera.position for v in views]).double()
     basis = sh_basis(torch.nn.functional.normalize(directions, dim=1), 3)  # the surfel is in the world's middle
     seen = (weights / weights.sum()).sqrt()[:, None] * basis
