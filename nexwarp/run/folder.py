@@ -197,27 +197,28 @@ def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool
         raise SettingError("--resume, --overwrite: expected at most one of them, got both")
     if source.path != DEMO and Path(source.path).resolve().is_relative_to(run.resolve()):
         raise SettingError(f"--run: expected a folder that does not contain the scene, got {run}")
-    parent = run.resolve().parent.parent
-    if run.resolve() in teacher_folders(parent):
-        raise RunError(f"--run: expected a run of its own, got {run}, a teacher of {parent}")
+    owner = run.resolve().parent.parent
+    if run.resolve().parent.name == TEACHERS_FOLDER and is_run(owner):
+        raise RunError(f"--run: expected a run of its own, got {run}, a teacher of {owner}")
     if resume and is_run(run):
         return True
     # A process that is killed before it has written the config leaves a lock and temporary files.
     empty = run.is_dir() and all(file.name == LOCK_FILE or is_temporary(file.name) for file in run.iterdir())
     if resume and not empty:
         raise MissingError(f"{run}: expected a run to resume, found no {CONFIG_FILE} there")
-    if run.exists() and not empty and not overwrite:
+    if empty or not run.exists():
+        return False
+    if not overwrite:
         raise RunError(
             f"{run}: expected a new run folder, but it exists; give --resume or --overwrite, or another --run"
         )
-    if run.exists() and not empty:
-        try:
-            read_run(run)
-        except (MissingError, FormatError) as error:
-            raise RunError(
-                f"{run}: expected a run folder to overwrite, and nothing was deleted; give another --run, or delete "
-                f"the folder yourself ({error})"
-            ) from None
+    try:
+        read_run(run)
+    except (MissingError, FormatError) as error:
+        raise RunError(
+            f"{run}: expected a run folder to overwrite, and nothing was deleted; give another --run, or delete "
+            f"the folder yourself ({error})"
+        ) from None
     return False
 
 
@@ -307,11 +308,11 @@ def update_run(run: Path, record: RunRecord) -> None:
 
 def check_teachers_place(run: Path, count: int) -> None:
     """Raise RunError where something that is not the run's is where it would put its own teachers; change nothing."""
-    places = [TEACHERS_FOLDER, *(f"{TEACHERS_FOLDER}/{number}" for number in range(1, count + 1))]
-    for name in list_files(run)[1] if count else ():
-        if name.rstrip("/") in places:
+    folders = [teacher_folder(run, number) for number in range(1, count + 1)]
+    for place in (*(folder.parent for folder in folders), *folders):
+        if place.is_symlink() or place.is_file():
             raise RunError(
-                f"{run / name}: expected a teacher's folder or nothing, got what nexwarp did not write; move it, or "
+                f"{place}: expected a teacher's folder or nothing, got what nexwarp did not write; move it, or "
                 "give another --run"
             )
 
@@ -324,16 +325,6 @@ def picture_name(view: str) -> str:
 def teacher_folder(run: Path, number: int) -> Path:
     """Return the folder of a teacher that a run trains for itself, a run too; teachers are counted from 1."""
     return run / TEACHERS_FOLDER / str(number)
-
-
-def teacher_folders(run: Path) -> list[Path]:
-    """Return the existing folders of a run's own teachers; its config tells how many it has."""
-    try:
-        count = int(read_json(run / CONFIG_FILE)["own_teachers"]["count"])
-    except (*READ_ERRORS, KeyError, TypeError):  # it has none, or the config is damaged
-        return []
-    folders = [teacher_folder(run, number) for number in range(1, min(count, MOST_TEACHERS) + 1)]
-    return [folder for folder in folders if folder.is_dir() and not (folder.is_symlink() or folder.parent.is_symlink())]
 
 
 def list_files(run: Path) -> tuple[list[str], list[str]]:
@@ -483,9 +474,9 @@ def open_model(path: Path) -> OpenedModel:
     file = path / MODEL_FILE
     if path.is_file() and path.suffix == SUFFIX:
         folder, file = (path.parent if path.name == MODEL_FILE else path.with_suffix("")), path
-        if path.name != MODEL_FILE and ((folder / CONFIG_FILE).is_file() or (folder / MODEL_FILE).is_file()):
+        if path.name != MODEL_FILE and (is_run(folder) or (folder / MODEL_FILE).is_file()):
             folder = path.with_name(f"{path.name}.results")  # another model's folder is left alone
-    if (folder / CONFIG_FILE).is_file() and file == folder / MODEL_FILE:
+    if is_run(folder) and file == folder / MODEL_FILE:
         record = read_run(folder)
         return OpenedModel(path, folder, file, record.source, record.config)
     if not file.is_file():

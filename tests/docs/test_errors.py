@@ -44,6 +44,7 @@ def test_boundaries_raise_the_family(tmp_path):
         (SettingError, lambda: pick_device("tpu")),
         (SettingError, lambda: RenderOrder(path="circle").check()),
         (RunError, lambda: prepare_run(tmp_path / "run", source, resume=False, overwrite=False)),
+        (RunError, lambda: prepare_run(tmp_path / "run" / "teachers" / "1", source, resume=False, overwrite=False)),
         (SettingError, lambda: prepare_run(tmp_path / "run", source, resume=True, overwrite=True)),
     ):
         with pytest.raises(kind) as caught:
