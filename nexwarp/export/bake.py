@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
-from torch.nn.functional import grid_sample, normalize, pad
+from torch.nn.functional import grid_sample, normalize
 
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
@@ -65,11 +65,9 @@ class Layout:
         """Return the surfels (T,) int64 that have a texture."""
         return (self.boxes[:, 2] > self.boxes[:, 0]).nonzero()[:, 0]
 
-    def texels(self, ids: torch.Tensor, local: torch.Tensor) -> torch.Tensor:
-        """Return columns and rows (..., 2), whole at centres of texels, of coordinates (..., 2) [scales] on surfels."""
-        boxes, rects = self.boxes[ids], self.rects[ids].to(local)
-        share = (local - boxes[..., :2]) / (boxes[..., 2:] - boxes[..., :2]).clamp_min(1e-12)
-        return rects[..., :2] + share.clamp(0, 1) * (rects[..., 2:] - 1)
+    def ends(self) -> torch.Tensor:
+        """Return the `rects` (N, 4) of a `BakedScene`: each first texel, and the way from it to the last one."""
+        return torch.cat([self.rects[:, :2], self.rects[:, 2:] - 1], dim=1).float()
 
     def centres(self) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
         """Yield columns and rows of about a million texels (M, 2), their surfels (M,), coordinates on these (M, 2)."""
@@ -85,60 +83,24 @@ class Layout:
             yield rects[:, :2] + inside, ids, boxes[:, :2] + share * (boxes[:, 2:] - boxes[:, :2])
 
 
-@dataclass(frozen=True)
-class Baked:
-    """Surfels whose colour at a point is their plain colour plus a texel of the atlas, for all hits of a pixel."""
-
-    model: Model  # that was baked
-    surfels: Surfels  # its surfels, with SH that take over the texture's dependence on the direction
-    seen: Observations  # what the views see of the surfels
-    layout: Layout  # the surfels' texels in the atlas
-    atlas: torch.Tensor  # (height, width, 3) float32, added to the plain colours, sRGB
-
-    def added(self, ids: torch.Tensor, local: torch.Tensor) -> torch.Tensor:
-        """Return what the atlas adds (..., 3) to the colours of surfels (...) at coordinates (..., 2) on them."""
-        return sample(self.atlas, self.layout.texels(ids, local))
-
-    def scene(self) -> BakedScene:
-        """Return the scene that a page draws of it, at the mean exposure."""
-        options, surfels, rects = self.model.options, self.surfels, self.layout.rects.float()
-        used = (options.sh_degree + 1) ** 2 - 1
-        return BakedScene(
-            Activated(*(x.detach() for x in surfels.activated())),
-            pad(self.atlas, (0, 1)),
-            self.layout.boxes,
-            torch.cat([rects[:, :2], rects[:, 2:] - 1], dim=1),
-            (surfels.sh0.detach(), surfels.shN.detach()[:, :used]),
-            self.model.detail_limits if options.detail_limits else None,
-            background=options.background,
-        )
-
-    def mean_colors(self) -> torch.Tensor:
-        """Return the plain colours (N, 3) of the surfels from the mean directions that the views see them in."""
-        surfels, degree = self.surfels, self.model.options.sh_degree
-        return ops.plain_colors((surfels.sh0, surfels.shN), self.seen.directions, surfels.means.new_zeros(3), degree)
-
-
-def bake(model: Model, views: Views, *, steps: int | None = None, progress: Progress = lambda *_: None) -> Baked:
+def bake(model: Model, views: Views, *, steps: int | None = None, progress: Progress = lambda *_: None) -> BakedScene:
     """Bake a model's texture into an atlas whose texels are about a pixel of the closest of the given views.
 
     It is fitted to the photos of the views, or for cameras to the model's renderings; see `fit`. `progress` is called
-    with each stage's name, how many views or steps of it are done, and of how many.
+    with each stage's name, how many views or steps of it are done, and of how many. The scene is at the mean exposure.
     """
-    baked = measure(model, views, progress)
-    scene = fit(baked.scene(), model, views, steps, partial(progress, "baking the texture"))
-    assert scene.harmonics is not None
-    sh0, shN = scene.harmonics
-    state = {name: x.detach().clone() for name, x in baked.surfels.state_dict().items()}
-    state |= {"sh0": sh0, "logit_opacities": torch.logit(scene.shape.opacities, END)}
-    state["shN"][:, : shN.shape[1]] = shN
-    return replace(baked, surfels=Surfels(state), atlas=scene.texels[..., :3])
+    scene, _ = measure(model, views, progress)
+    scene = fit(scene, model, views, steps, partial(progress, "baking the texture"))
+    raw, logits = model.surfels, torch.logit(scene.shape.opacities, END)  # bounded, as those of models are
+    with torch.no_grad():
+        shape = ops.activate(raw.raw_quats, raw.log_scales, logits, raw.raw_gammas)
+    return replace(scene, shape=Activated(scene.shape.means, *shape))
 
 
-def measure(model: Model, views: Views, progress: Progress = lambda *_: None) -> Baked:
-    """Return the first atlas, of the texture itself, before any fit."""
+def measure(model: Model, views: Views, progress: Progress = lambda *_: None) -> tuple[BakedScene, Observations]:
+    """Return the scene with the first atlas, of the texture itself, before any fit, and what the views see."""
     seen = observe(model, cameras_of(views), partial(progress, "measuring surfels"))
-    return evaluate(model, seen, lay_out(seen.boxes, seen.pixels))
+    return evaluate(model, seen, lay_out(seen.boxes, seen.pixels)), seen
 
 
 def points_on(surfels: Surfels | Activated, ids: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
@@ -158,26 +120,22 @@ def dimmed(model: Model, colors: torch.Tensor) -> float:
     return 1.0 / max(float(brightest.sort().values[int(UNCLIPPED * (len(brightest) - 1))]), 1.0)
 
 
-def untextured(model: Model, surfels: Surfels | None = None) -> Model:
-    """Return a model that keeps 8 hits a pixel, without texture, at the mean exposure, with other colours if given."""
-    options = model.options.changed(max_hits=MAX_HITS, exposure="mean", clamp_texture=False)
-    return Model(surfels or model.surfels, None, None, model.detail_limits, options, model.meta)
-
-
 @torch.no_grad()
 def observe(
     model: Model, cameras: Sequence[Camera], progress: Callable[[int, int], object] = lambda *_: None
 ) -> Observations:
     """Render all views without texture and gather what they see of each surfel; K decides which hits are textured."""
-    bare, kept = untextured(model), model.options.max_hits
+    kept = model.options.max_hits
+    options = model.options.changed(max_hits=MAX_HITS, exposure="mean", clamp_texture=False)
+    untextured = Model(model.surfels, None, None, model.detail_limits, options, model.meta)
     count, means = len(model.surfels), model.surfels.means.detach()
     boxes = means.new_tensor([NOWHERE, NOWHERE, -NOWHERE, -NOWHERE]).repeat(count, 1)
     pixels, total, textured = means.new_zeros(count, 2), means.new_zeros(count), means.new_zeros(count)
     directions, scales = means.new_zeros(count, 3), model.surfels.scales.detach()
     sides = axes(model.surfels.quats.detach())[:2]
     for done, camera in enumerate(cameras, 1):
-        camera = camera.to(bare.device)
-        out = bare.render(camera)
+        camera = camera.to(model.device)
+        out = untextured.render(camera)
         slots = (out.weights >= TINY_WEIGHT).flatten().nonzero()[:, 0]  # of the hits; a pixel's first is the heaviest
         ids, weights, depths = (x.flatten()[slots] for x in (out.ids.long(), out.weights, out.depths))
         places, sides_of = slots // MAX_HITS, [axis[ids] for axis in sides]
@@ -247,30 +205,47 @@ def _pack(sizes: torch.Tensor, width: int) -> tuple[torch.Tensor, int]:
     return packed, -(-(top + tallest) // 4) * 4
 
 
-def sample(atlas: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
-    """Interpolate an atlas (height, width, C) bilinearly at places (..., 2), column and row; differentiable."""
-    size = atlas.new_tensor([atlas.shape[1], atlas.shape[0]])
+def texels_at(scene: BakedScene, ids: torch.Tensor, local: torch.Tensor) -> torch.Tensor:
+    """Return texels (..., 4) of surfels (...) at coordinates (..., 2) [scales] on them, bilinearly."""
+    boxes, rects = scene.boxes[ids], scene.rects[ids]
+    share = (local - boxes[..., :2]) / (boxes[..., 2:] - boxes[..., :2]).clamp_min(1e-12)
+    places = rects[..., :2] + share.clamp(0, 1) * rects[..., 2:]
+    size = places.new_tensor([scene.texels.shape[1], scene.texels.shape[0]])
     grid = ((2 * places + 1) / size - 1).reshape(1, -1, 1, 2)
-    values = grid_sample(atlas.permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border")
-    return values[0, :, :, 0].T.reshape(*places.shape[:-1], atlas.shape[2])
+    values = grid_sample(scene.texels.permute(2, 0, 1)[None], grid, align_corners=False, padding_mode="border")
+    return values[0, :, :, 0].T.reshape(*local.shape[:-1], 4)
+
+
+def mean_colors(model: Model, seen: Observations) -> torch.Tensor:
+    """Return the plain colours (N, 3) of the surfels from the mean directions that the views see them in."""
+    surfels, degree = model.surfels, model.options.sh_degree
+    return ops.plain_colors((surfels.sh0, surfels.shN), seen.directions, surfels.means.new_zeros(3), degree)
 
 
 @torch.no_grad()
-def evaluate(model: Model, seen: Observations, layout: Layout) -> Baked:
+def evaluate(model: Model, seen: Observations, layout: Layout) -> BakedScene:
     """Bake the texture, weighted by each surfel's textured share, at texels seen from the mean directions."""
     surfels, texture, options = model.surfels, model.texture, model.options
-    atlas = surfels.means.new_zeros(layout.height, layout.width, 3)
-    baked = Baked(model, surfels, seen, layout, atlas)
+    texels = surfels.means.new_zeros(layout.height, layout.width, 4)
+    scene = BakedScene(
+        Activated(*(x.detach() for x in surfels.activated())),
+        texels,
+        layout.boxes,
+        layout.ends(),
+        (surfels.sh0.detach(), surfels.shN.detach()[:, : (options.sh_degree + 1) ** 2 - 1]),
+        model.detail_limits if options.detail_limits else None,
+        background=options.background,
+    )
     if texture is None or options.max_hits == 0:
-        return baked
+        return scene
     if not isinstance(texture, NeuralTexture):
         raise FormatError(f"texture: expected a nexwarp.NeuralTexture to bake, got {type(texture).__name__}")
-    plain = torch.zeros_like(surfels.means) if texture.residual else baked.mean_colors()
+    plain = torch.zeros_like(surfels.means) if texture.residual else mean_colors(model, seen)
     # A pixel of the closest view, in world units: levels of finer cells fade as they do there.
     sizes = (surfels.scales / seen.pixels.clamp_min(1e-12)).amin(1)
     colors_at = partial(texture.evaluate, focal=1.0, sh_degree=options.sh_degree, clamp=options.clamp_texture)
     for places, ids, local in layout.centres():
         points = points_on(surfels, ids, local * surfels.scales[ids])
         colors = colors_at(points[:, None], sizes[ids, None], seen.directions[ids])[:, 0]
-        atlas[places[:, 1], places[:, 0]] = seen.textured[ids, None] * (colors - plain[ids])
-    return baked
+        texels[places[:, 1], places[:, 0], :3] = seen.textured[ids, None] * (colors - plain[ids])
+    return scene

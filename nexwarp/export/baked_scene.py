@@ -142,11 +142,12 @@ def card_scene(
     texels: torch.Tensor,
     rects: torch.Tensor,
     cut: Cut | None,
+    exposure: float,
 ) -> BakedScene:
     """Return a scene of cards: their centres (N, 3), quats (N, 4) and half sides (N, 2), and the rest of its fields."""
     ones = torch.ones_like(geometry[2])
     shape = Activated(*geometry, ones[:, 0], HARD * ones)
-    return BakedScene(shape, texels, torch.cat([-ones, ones], dim=1), rects, cut=cut)
+    return BakedScene(shape, texels, torch.cat([-ones, ones], dim=1), rects, cut=cut, exposure=exposure)
 
 
 def load_baked(path: str | os.PathLike[str]) -> BakedScene:
@@ -319,8 +320,7 @@ def _read_cards(content: bytes) -> BakedScene:
     extras = tree["asset"].get("extras")
     exposure = float(extras.get("exposure", 1.0)) if isinstance(extras, dict) else 1.0
     check_range("exposure", exposure, 1e-6, 1.0)
-    cards = card_scene(geometry, picture.float() / 255, torch.cat([first_place, last], dim=1), cut)
-    return dataclasses.replace(cards, exposure=exposure)
+    return card_scene(geometry, picture.float() / 255, torch.cat([first_place, last], dim=1), cut, exposure)
 
 
 def _view(tree: Header, binary: bytes, index: int) -> bytes:

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import torch
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.similarity import upright
 from nexwarp.errors import FormatError
-from nexwarp.export.bake import Baked, Progress, dimmed, lay_out, measure, points_on
+from nexwarp.export.bake import Observations, Progress, dimmed, lay_out, mean_colors, measure, points_on, texels_at
 from nexwarp.export.baked_scene import BakedScene, Header, card_scene
 from nexwarp.export.fit import Views, fit
 from nexwarp.io.files import write_atomically
@@ -42,42 +41,39 @@ def bake_cards(
 
     `aim` is the model itself, or a better one of the same scene, whose colours may depend on the direction.
     """
-    cards = make_cards(measure(model, views, progress), alpha)
+    cards = make_cards(model, *measure(model, views, progress), alpha)
     if not len(cards.shape.means):
         return cards
     return fit(cards, aim or model, views, steps, partial(progress, "baking the texture"))
 
 
 @torch.no_grad()
-def make_cards(baked: Baked, alpha: str = "mask") -> BakedScene:
-    """Return a baked scene as cards, for `save_glb`: cut out ("mask") or blended ("blend").
+def make_cards(model: Model, scene: BakedScene, seen: Observations, alpha: str) -> BakedScene:
+    """Return what `measure` returns of a model as cards, for `save_glb`: cut out ("mask") or blended ("blend").
 
     Colours are those from the direction in which the views see each surfel, at the photos' mean exposure or a darker
     one: where photos differ much in exposure, half of a sunny scene would be clipped at the mean.
     """
-    surfels = baked.surfels
+    surfels = model.surfels
     least = LEAST_ALPHA[alpha] * CUTOFF
     opacities, gammas = surfels.opacities.clamp(max=ALPHA_MAX), surfels.gammas
     # |u|^(2 gamma) = 2 log(opacity / alpha) at the end of the quad.
     reach = (2 * (opacities / least).clamp_min(1).log())[:, None].pow(0.5 / gammas)
     shown = opacities > (CUTOFF if alpha == "mask" else 2 * least)
-    layout = lay_out(torch.cat([-reach, reach], dim=1).where(shown[:, None], 0.0), baked.seen.pixels, fewest=FEWEST)
-    plain = baked.mean_colors()
+    layout = lay_out(torch.cat([-reach, reach], dim=1).where(shown[:, None], 0.0), seen.pixels, fewest=FEWEST)
+    plain = mean_colors(model, seen)
     texels = reach.new_zeros(layout.height, layout.width, 4)
     for places, ids, local in layout.centres():
-        colors = plain[ids] + baked.added(ids, local)
+        colors = plain[ids] + texels_at(scene, ids, local)[..., :3]
         exponent = local.square().clamp_min(1e-20).pow(gammas[ids]).sum(1)
         alphas = (surfels.opacities[ids] * torch.exp(-0.5 * exponent)).clamp(max=ALPHA_MAX)
         texels[places[:, 1], places[:, 0]] = torch.cat([colors, alphas[:, None]], dim=1)
-    exposure = dimmed(baked.model, texels[..., :3][texels[..., 3] >= least])
+    exposure = dimmed(model, texels[..., :3][texels[..., 3] >= least])
     texels[..., :3] = (texels[..., :3] * exposure).clamp(0, 1)
     ids = layout.textured()
-    rects = layout.rects[ids].float()
-    scales = surfels.scales[ids] * reach[ids]
     cut = Cut(CUTOFF) if alpha == "mask" else None
-    geometry = (surfels.means[ids], surfels.quats[ids], scales)
-    cards = card_scene(geometry, texels, torch.cat([rects[:, :2], rects[:, 2:] - 1], dim=1), cut)
-    return replace(cards, exposure=exposure)
+    geometry = (surfels.means[ids], surfels.quats[ids], surfels.scales[ids] * reach[ids])
+    return card_scene(geometry, texels, layout.ends()[ids], cut, exposure)
 
 
 @torch.no_grad()

@@ -8,13 +8,14 @@ import torch
 
 import nexwarp as nw
 from nexwarp.cameras.similarity import upright
-from nexwarp.export.bake import Baked, bake, evaluate, lay_out, observe
-from nexwarp.export.baked_scene import ATLAS_FILE, BAKED_FILE
-from nexwarp.export.glb import CUTOFF, make_cards, save_glb
+from nexwarp.export.bake import bake, evaluate, lay_out, mean_colors, measure, observe, texels_at
+from nexwarp.export.baked_scene import ATLAS_FILE, BAKED_FILE, BakedScene
+from nexwarp.export.glb import CUTOFF, bake_cards, make_cards, save_glb
 from nexwarp.export.splats import gaussians, save_splats_spz
 from nexwarp.export.web.baked import encode_atlas, encode_baked, encode_harmonics
 from tests.export.web import support
-from tests.export.web.support import as_stored, psnr, rendered, ring
+from tests.export.web.support import as_stored, psnr, ring
+from tests.narrowing import present
 from tests.scenes import make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 
@@ -38,21 +39,25 @@ def cameras() -> dict[str, nw.Camera]:
 
 
 @pytest.fixture(scope="module")
-def baked(model, cameras) -> Baked:
+def baked(model, cameras) -> BakedScene:
     return bake(model, list(cameras.values()), steps=40)
 
 
-def test_texels_have_one_owner_each_and_lie_where_sampling_looks_for_them(baked):
-    layout = baked.layout
+def test_texels_have_one_owner_each_and_lie_where_sampling_looks_for_them(model, cameras):
+    seen = observe(model, list(cameras.values()))
+    layout = lay_out(seen.boxes, seen.pixels)
     owners = torch.zeros(layout.height, layout.width, dtype=torch.long)
     ((places, ids, local),) = layout.centres()
     owners.index_put_((places[:, 1], places[:, 0]), torch.ones(len(ids), dtype=torch.long), accumulate=True)
     assert owners.max() == 1 and owners[0].sum() == 0, "the first row is that of surfels without a texture"
     assert owners.sum() == len(ids) > 0
-    assert_close(layout.texels(ids, local), places.float(), kind="value", name="places")
+    scene = evaluate(model, seen, layout)
+    scene.texels.copy_(torch.rand(scene.texels.shape, generator=torch.Generator().manual_seed(0)))
+    x, y = places.T
+    assert_close(texels_at(scene, ids, local), scene.texels[y, x], kind="value", name="texels")
     # Beyond its box a surfel has the colours of the box's side.
-    corners = (layout.rects[ids, :2] + layout.rects[ids, 2:] - 1).float()
-    assert_close(layout.texels(ids, local + 100.0), corners, kind="value", name="beyond")
+    x, y = (layout.rects[ids, :2] + layout.rects[ids, 2:] - 1).long().T
+    assert_close(texels_at(scene, ids, local + 100.0), scene.texels[y, x], kind="value", name="beyond")
 
 
 def test_an_atlas_that_is_too_small_has_larger_texels(model, cameras, monkeypatch):
@@ -69,30 +74,31 @@ def test_the_first_atlas_has_the_colors_of_the_texture(residual, cameras):
     model = make_model(residual, count=1, sh_degree=0)
     seen = observe(model, list(cameras.values()))
     assert seen.textured[0] == 1
-    image = rendered(evaluate(model, seen, lay_out(seen.boxes, 4 * seen.pixels)), cameras["1.png"])
+    image = evaluate(model, seen, lay_out(seen.boxes, 4 * seen.pixels)).render(cameras["1.png"])
     expected = model.render(cameras["1.png"]).image.detach()
     plain = model.bare(max_hits=0).render(cameras["1.png"]).image.detach()
     assert psnr(image, expected) > max(45, psnr(plain, expected) + 10)
 
 
 def test_the_fit_approaches_the_model(baked, model, cameras):
-    gains = []
+    gains, (start, _) = [], measure(model, list(cameras.values()))
     for camera in cameras.values():
         expected = model.render(camera).image.detach()
-        first = psnr(rendered(evaluate(model, baked.seen, baked.layout), camera), expected)
+        first = psnr(start.render(camera), expected)
         plain = psnr(model.bare(max_hits=0).render(camera).image.detach(), expected)
-        fitted = psnr(rendered(as_stored(baked), camera), expected)
+        fitted = psnr(as_stored(baked).render(camera), expected)
         assert fitted > plain + 6 and fitted > 24
         gains.append(fitted - first)
     assert sum(gains) > len(gains), "the fit helps by 1 dB"
 
 
 def test_codes_are_near_the_values(baked):
-    codes, scale = encode_atlas(baked.atlas)
-    inside = baked.atlas.clamp(-scale, scale)
+    atlas = baked.texels[..., :3]
+    codes, scale = encode_atlas(atlas)
+    inside = atlas.clamp(-scale, scale)
     assert float((support.decode_atlas(codes, scale) - inside).abs().max()) <= 0.51 * scale / 127
-    values = baked.surfels.shN.detach().numpy()
-    steps, ranges = encode_harmonics(baked.surfels)
+    values = present(baked.harmonics)[1].numpy()
+    steps, ranges = encode_harmonics(present(baked.harmonics)[1])
     error = np.abs(support.decode_harmonics(steps, ranges) - values)
     assert (error <= np.sqrt(np.abs(values) * ranges[0]) / 127 + ranges[0] / 127**2).all()
 
@@ -100,26 +106,28 @@ def test_codes_are_near_the_values(baked):
 @pytest.mark.cuda
 def test_a_gpu_bakes_what_the_cpu_bakes(model, baked, cameras, tmp_path):
     views = list(cameras.values())
-    there = bake(copy.deepcopy(model).cuda(), views, steps=40)
+    moved = copy.deepcopy(model).cuda()
+    there = bake(moved, views, steps=40)
     for camera in views:
-        assert psnr(rendered(as_stored(there), camera).cpu(), rendered(as_stored(baked), camera)) > 35
-    assert encode_baked(there, cameras).keys() == {BAKED_FILE, ATLAS_FILE}
+        assert psnr(as_stored(there).render(camera).cpu(), as_stored(baked).render(camera)) > 35
+    assert encode_baked(there, moved, cameras).keys() == {BAKED_FILE, ATLAS_FILE}
     pytest.importorskip("trimesh")
-    save_glb(tmp_path / "scene.glb", make_cards(there), views)
+    save_glb(tmp_path / "scene.glb", bake_cards(moved, views, steps=1), views)
 
 
-def test_the_gltf_file_holds_the_surfels(baked, cameras, tmp_path):
+def test_the_gltf_file_holds_the_surfels(model, cameras, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     file = tmp_path / "scene.glb"
-    save_glb(file, make_cards(baked), list(cameras.values()))
+    scene, seen = measure(model, list(cameras.values()))
+    save_glb(file, make_cards(model, scene, seen, "mask"), list(cameras.values()))
     read = trimesh.load(file)
     (mesh,) = read.geometry.values()
-    visible = (baked.surfels.opacities > CUTOFF).nonzero()[:, 0]
+    surfels = model.surfels
+    visible = (surfels.opacities > CUTOFF).nonzero()[:, 0]
     assert mesh.vertices.shape == (4 * len(visible), 3) and mesh.faces.shape == (2 * len(visible), 3)
     turn = read.graph.get(read.graph.nodes_geometry[0])[0]
     assert np.allclose(turn[:3, :3], upright(list(cameras.values()))) and not turn[:3, 3].any()
     back = torch.from_numpy(np.asarray(mesh.vertices)).float().reshape(-1, 4, 3)
-    surfels = baked.surfels
     across = (back - surfels.means[visible, None]) @ surfels.normals[visible, :, None]
     assert float(across.detach().abs().max()) < 1e-4, "corners lie in the surfels' planes"
     assert_close(back.mean(1), surfels.means[visible].detach(), kind="gradient", name="centres")
@@ -128,7 +136,8 @@ def test_the_gltf_file_holds_the_surfels(baked, cameras, tmp_path):
     middle = mesh.visual.uv.reshape(-1, 4, 2).mean(1)
     places = np.stack([middle[:, 0] * image.shape[1], (1 - middle[:, 1]) * image.shape[0]], 1) - 0.5
     found = support.bilinear(torch.from_numpy(image), torch.from_numpy(places)).numpy()
-    colors = baked.mean_colors()[visible] + baked.added(visible, torch.zeros(len(visible), 2))
+    added = texels_at(scene, visible, torch.zeros(len(visible), 2))[:, :3]
+    colors = mean_colors(model, seen)[visible] + added
     assert np.abs(found[:, :3] - colors.clamp(0, 1).detach().numpy()).mean() < 0.05
     assert np.abs(found[:, 3] - surfels.opacities[visible].detach().numpy()).max() < 0.05
     size = struct.unpack("<I", file.read_bytes()[12:16])[0]

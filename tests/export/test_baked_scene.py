@@ -9,9 +9,9 @@ import torch
 import nexwarp as nw
 from nexwarp import ops
 from nexwarp.errors import FormatError, MissingError
-from nexwarp.export.bake import bake, dimmed
+from nexwarp.export.bake import bake, dimmed, measure
 from nexwarp.export.baked_scene import BAKED_FILE, BakedScene
-from nexwarp.export.glb import CUTOFF, LEAST_ALPHA, make_cards, save_glb
+from nexwarp.export.glb import CUTOFF, LEAST_ALPHA, bake_cards, make_cards, save_glb
 from nexwarp.export.web.export import one_file, page_files
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
 from nexwarp.model.surfels import Activated
@@ -145,15 +145,14 @@ def test_a_page_is_read_as_it_is_drawn(files, model, baked, cameras, tmp_path):
     for camera in cameras.values():
         images = [scene.render(camera) for scene in scenes]
         assert all(torch.equal(image, images[0]) for image in images)
-        stored = as_stored(dataclasses.replace(baked, model=model)).scene()
-        expected = by_definition(in_double(stored), camera).detach() * model.exposures.factors(camera)
+        expected = by_definition(in_double(as_stored(baked)), camera).detach() * model.exposures.factors(camera)
         assert psnr(images[0], expected) > 75
 
 
 @pytest.mark.parametrize("alpha", ["mask", "blend"])
-def test_cards_are_read_as_they_were_written(alpha, baked, cameras, tmp_path):
+def test_cards_are_read_as_they_were_written(alpha, model, cameras, tmp_path):
     pytest.importorskip("trimesh")
-    cards = make_cards(baked, alpha)
+    cards = bake_cards(model, list(cameras.values()), alpha, steps=10)
     save_glb(tmp_path / "a.glb", cards, list(cameras.values()))
     read = nw.load_baked(tmp_path / "a.glb")
     assert read.cut == cards.cut and (read.cut is None) == (alpha == "blend")
@@ -168,20 +167,22 @@ def test_cards_are_read_as_they_were_written(alpha, baked, cameras, tmp_path):
         assert psnr(read.render(camera), expected) > (30 if alpha == "mask" else 60)
 
 
-def test_cards_of_a_bright_scene_are_dimmed_not_clipped(baked, cameras, tmp_path):
+def test_cards_of_a_bright_scene_are_dimmed_not_clipped(model, cameras, tmp_path):
     """At three times the brightness, cards show what they show at one, and `render_at_mean` three times of it."""
     pytest.importorskip("trimesh")
-    once = make_cards(baked, "blend")
-    state = {name: x.clone() for name, x in baked.surfels.state_dict().items()}
+    scene, seen = measure(model, list(cameras.values()))
+    once = make_cards(model, scene, seen, "blend")
+    state = {name: x.clone() for name, x in model.surfels.state_dict().items()}
     state["sh0"] = 3 * state["sh0"] + (3 - 1) * 0.5 / 0.28209479177387814  # SH are around a grey of 0.5
     state["shN"] *= 3
-    bright = make_cards(dataclasses.replace(baked, surfels=nw.Surfels(state), atlas=3 * baked.atlas), "blend")
+    three_times = nw.Model(nw.Surfels(state), None, model.exposures, options=model.options)
+    bright = make_cards(three_times, dataclasses.replace(scene, texels=3 * scene.texels), seen, "blend")
     assert bright.exposure < 0.6 and bright.exposure == pytest.approx(once.exposure / 3, abs=1e-6)
     opaque = bright.texels[bright.texels[..., 3] >= LEAST_ALPHA["blend"] * CUTOFF][:, :3].amax(1)
     assert 0.001 < float((opaque == 1).double().mean()) < 0.021
     assert_close(bright.texels, once.texels, kind="value", name="texels")
-    unexposed = dataclasses.replace(baked.model.options, exposure="mean")
-    assert dimmed(nw.Model(baked.surfels, None, baked.model.exposures, None, unexposed), torch.full((5, 3), 3.0)) == 1
+    unexposed = dataclasses.replace(model.options, exposure="mean")
+    assert dimmed(nw.Model(model.surfels, None, model.exposures, None, unexposed), torch.full((5, 3), 3.0)) == 1
     save_glb(tmp_path / "a.glb", bright, list(cameras.values()))
     read = nw.load_baked(tmp_path / "a.glb")
     assert read.exposure == bright.exposure
@@ -191,9 +192,9 @@ def test_cards_of_a_bright_scene_are_dimmed_not_clipped(baked, cameras, tmp_path
         assert psnr(image, bright.render(camera, background=[x * bright.exposure for x in background])) > 45
 
 
-def test_damaged_files_give_one_line(files, baked, cameras, tmp_path):
+def test_damaged_files_give_one_line(files, model, cameras, tmp_path):
     pytest.importorskip("trimesh")
-    save_glb(tmp_path / "good.glb", make_cards(baked), list(cameras.values()))
+    save_glb(tmp_path / "good.glb", bake_cards(model, list(cameras.values()), steps=1), list(cameras.values()))
     page, glb = one_file(files), (tmp_path / "good.glb").read_bytes()
     with pytest.raises(MissingError, match="expected a page or a"):
         nw.load_baked(tmp_path / "none.glb")

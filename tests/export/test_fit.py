@@ -37,7 +37,7 @@ def test_photos_help_each_form(form, gain, model, tiny_scene):
     views, results = tiny_scene.train, []
     for seen in ([view.camera for view in views], views):
         page = form == "page"
-        scene = bake(model, seen, steps=STEPS).scene() if page else bake_cards(model, seen, form, steps=STEPS)
+        scene = bake(model, seen, steps=STEPS) if page else bake_cards(model, seen, form, steps=STEPS)
         results.append((quality(scene, model, views), quality(scene, model, tiny_scene.test)))
     (without, without_test), (with_photos, test) = results
     assert with_photos > without + gain and test > without_test
@@ -53,7 +53,7 @@ def test_masked_pixels_do_not_count(model, tiny_scene):
     mask[:, 20:] = False
     noise = torch.randint(0, 256, view.image.shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     images = [view.image, torch.where(mask[..., None], view.image, noise)]
-    start = make_cards(measure(model, [view]), "blend")
+    start = make_cards(model, *measure(model, [view]), "blend")
     texels = [fit(start, model, [dataclasses.replace(view, image=x, mask=mask)], 6).texels for x in images]
     assert torch.equal(*texels) and not torch.equal(texels[0], start.texels)
 

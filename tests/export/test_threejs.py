@@ -11,8 +11,7 @@ from PIL import Image
 
 import nexwarp as nw
 from nexwarp.cameras.similarity import upright
-from nexwarp.export.bake import bake
-from nexwarp.export.glb import make_cards, save_glb
+from nexwarp.export.glb import bake_cards, save_glb
 from tests.export.web.support import CHROMIUM, FLAGS, URL, Tab, psnr, ring
 from tests.scenes import make_surfels, make_texture, random_scene
 
@@ -72,7 +71,7 @@ def test_three_js_draws_what_is_read_back(tmp_path: Path) -> None:
     """Its tests of depth and alpha, its texture, and which way is up."""
     cameras = ring()
     model = nw.Model(make_surfels(random_scene(40, width=64, height=48, seed=3)), make_texture(residual=True))
-    save_glb(tmp_path / "scene.glb", make_cards(bake(model, [*cameras.values()], steps=1)), [*cameras.values()])
+    save_glb(tmp_path / "scene.glb", bake_cards(model, [*cameras.values()], steps=1), [*cameras.values()])
     read = nw.load_baked(tmp_path / "scene.glb")
     for camera in (cameras["0.png"], cameras["3.png"]):
         picture = drawn((tmp_path / "scene.glb").read_bytes(), camera, upright([*cameras.values()]))

@@ -9,8 +9,7 @@ from PIL import Image
 
 from nexwarp.cameras.similarity import upright
 from nexwarp.errors import FormatError
-from nexwarp.export.bake import bake
-from nexwarp.export.glb import make_cards, quads
+from nexwarp.export.glb import bake_cards, quads
 from nexwarp.export.mesh import Mesh
 from nexwarp.export.usd import save_usdz
 from nexwarp.io.pictures import to_uint8
@@ -26,7 +25,7 @@ pytest.importorskip("pxr", reason="usd-core (extra `usd`)")
 def made():
     """A model, cameras around it, and its cards."""
     model, views = make_model(), list(ring().values())
-    return model, views, make_cards(bake(model, views, steps=1))
+    return model, views, bake_cards(model, views, steps=1)
 
 
 def opened(file):
@@ -112,5 +111,5 @@ def test_without_cards_there_is_no_file(made, tmp_path):
     with torch.no_grad():
         model.surfels.logit_opacities.fill_(-9.0)
     with pytest.raises(FormatError, match="expected surfels that are opaque enough"):
-        save_usdz(tmp_path / "scene.usdz", make_cards(bake(model, views, steps=1)), model.surfels, 1, views)
+        save_usdz(tmp_path / "scene.usdz", bake_cards(model, views, steps=1), model.surfels, 1, views)
     assert not list(tmp_path.iterdir())

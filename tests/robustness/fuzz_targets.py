@@ -25,7 +25,7 @@ from nexwarp.data.ply import read_ply
 from nexwarp.data.scene import SceneSource
 from nexwarp.data.sfm.photos import camera_groups, read_photos
 from nexwarp.export.bake import bake
-from nexwarp.export.glb import make_cards, save_glb
+from nexwarp.export.glb import bake_cards, save_glb
 from nexwarp.export.splats import gaussians, save_splats_ply
 from nexwarp.export.web.baked import encode_baked
 from nexwarp.io.json_files import write_json
@@ -274,11 +274,12 @@ def _photo_files(folder: Path) -> list[Files]:
 
 
 def _baked(folder: Path) -> list[Files]:
-    model, views = _some_model(folder / "scene"), _cameras(folder / "views")
-    baked = bake(model, list(views.values()), steps=1)
-    save_glb(folder / "scene.glb", make_cards(baked, "blend"), list(views.values()))
+    model, named = _some_model(folder / "scene"), _cameras(folder / "views")
+    views = list(named.values())
+    save_glb(folder / "scene.glb", bake_cards(model, views, "blend", steps=1), views)
     _read_baked(folder)
-    return [encode_baked(baked, views), {"scene.glb": (folder / "scene.glb").read_bytes()}]
+    page = encode_baked(bake(model, views, steps=1), model, named)
+    return [page, {"scene.glb": (folder / "scene.glb").read_bytes()}]
 
 
 def _read_baked(folder: Path) -> None:

@@ -7,51 +7,57 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.export.bake import Baked
-from nexwarp.export.baked_scene import ATLAS_FILE, BAKED_FILE, MAGIC
+from nexwarp.export.baked_scene import ATLAS_FILE, BAKED_FILE, MAGIC, BakedScene
 from nexwarp.export.web.scene_file import array_of, joined_file, scene_arrays, scene_header
 from nexwarp.model.model import Model
-from nexwarp.model.surfels import Surfels
 
 QUALITY = 95  # of the lossy picture: 0.1 dB against photos of the demo, at 0.3 of the size of a lossless one
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
 
 
 @torch.no_grad()
-def encode_baked(baked: Baked, cameras: Mapping[str, Camera], facts: Mapping[str, object] = {}) -> dict[str, bytes]:
-    """Return the files of a baked scene, content by name; `facts` are those of `encode_scene`."""
-    model, layout = baked.model, baked.layout
-    picture, scale = encode_picture(baked.atlas)
-    harmonics, ranges = encode_harmonics(baked.surfels)
-    bare = Model(baked.surfels, None, model.exposures, model.detail_limits, model.options, model.meta)
-    scene = scene_arrays(bare)
-    quats = np.rint((scene["quats"].astype(np.float64) + 1) / 2 * 65535)
-    count = len(scene["means"])
-    farthest = scene["limits"][:, 1] if "limits" in scene else np.full(count, LARGEST_FLOAT, np.float32)
-    arrays = {
-        "means": scene["means"],
+def encode_baked(
+    scene: BakedScene, model: Model, cameras: Mapping[str, Camera], facts: Mapping[str, object] = {}
+) -> dict[str, bytes]:
+    """Return the files of the scene that `bake` has made of a model, content by name.
+
+    `facts` are those of `encode_scene`. The model's SH of degrees that it does not show are kept.
+    """
+    assert scene.harmonics is not None
+    sh0, shN = scene.harmonics
+    height, width = scene.texels.shape[:2]
+    picture, scale = encode_picture(scene.texels[..., :3])
+    harmonics, ranges = encode_harmonics(torch.cat([shN, model.surfels.shN[:, shN.shape[1] :]], dim=1))
+    arrays = scene_arrays(model)
+    quats = np.rint((arrays["quats"].astype(np.float64) + 1) / 2 * 65535)
+    farthest = arrays["limits"][:, 1] if "limits" in arrays else np.full(len(quats), LARGEST_FLOAT, np.float32)
+    sections = {
+        "means": arrays["means"],
         "quats": quats.clip(0, 65535).astype(np.uint16),
-        **{name: scene[name] for name in ("scales", "opacities", "gammas")},
+        "scales": arrays["scales"],
+        "opacities": array_of(scene.shape.opacities),
+        "gammas": arrays["gammas"],
         "farthest": farthest.clip(0, LARGEST_FLOAT),
-        "boxes": array_of(layout.boxes),
-        "rects": layout.rects.cpu().numpy().astype(np.uint16),
-        "sh0": scene["sh"][:, 0],
-        **{name: scene[name] for name in ("exposures",) if name in scene},
+        "boxes": array_of(scene.boxes),
+        "rects": (array_of(scene.rects) + np.array([0, 0, 1, 1])).astype(np.uint16),
+        "sh0": array_of(sh0[:, 0]),
+        **{name: arrays[name] for name in ("exposures",) if name in arrays},
         "shN": harmonics,
     }
-    header = scene_header(bare, scene, cameras, facts) | {
-        "atlas": {"file": ATLAS_FILE, "width": layout.width, "height": layout.height, "scale": scale},
+    header = scene_header(model, arrays, cameras, facts) | {
+        "texture": None,
+        "atlas": {"file": ATLAS_FILE, "width": width, "height": height, "scale": scale},
         "sh_ranges": ranges,
     }
-    return {BAKED_FILE: joined_file(MAGIC, header, arrays), ATLAS_FILE: picture}
+    return {BAKED_FILE: joined_file(MAGIC, header, sections), ATLAS_FILE: picture}
 
 
-def encode_harmonics(surfels: Surfels) -> tuple[np.ndarray, list[float]]:
-    """Quantise the SH coefficients above degree 0 to (N, C - 1, 3) uint8 codes, and the ranges of degrees 1, 2, 3.
+def encode_harmonics(coefficients: torch.Tensor) -> tuple[np.ndarray, list[float]]:
+    """Quantise SH coefficients above degree 0, (N, C - 1, 3), to uint8 codes; also return ranges of degrees 1, 2, 3.
 
     A code c is the value sign(c - 128) ((c - 128) / 127)^2 range: small values, which are most, have fine steps.
     """
-    values = array_of(surfels.shN)
+    values = array_of(coefficients)
     codes, ranges = np.full(values.shape, 128, np.uint8), []
     for degree in (1, 2, 3):
         band = slice(degree**2 - 1, (degree + 1) ** 2 - 1)

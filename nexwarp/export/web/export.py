@@ -142,8 +142,8 @@ def page_files(
     if poster is not None:
         content[picture] = poster
     if cameras and len(model.surfels):
-        baked = bake(model, views or list(cameras.values()), progress=progress)
-        content |= encode_baked(replace(baked, model=shown), cameras, scale)
+        scene = bake(model, views or list(cameras.values()), progress=progress)
+        content |= encode_baked(scene, shown, cameras, scale)
     return content
 
 

@@ -17,10 +17,11 @@ import torch
 from PIL import Image
 
 import nexwarp as nw
-from nexwarp.export.bake import Baked
+from nexwarp.export.baked_scene import BakedScene
 from nexwarp.export.web.baked import encode_harmonics, encode_picture
 from nexwarp.export.web.quantise import CHUNK
 from nexwarp.model.texture import NEVER
+from tests.narrowing import present
 from tests.scenes import intrinsics, make_camera, make_surfels, make_texture, random_scene, rigid
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -149,12 +150,6 @@ def ring_model(cameras: dict[str, nw.Camera], count: int, limits: nw.DetailLimit
     return nw.Model(surfels, texture, exposures, limits, nw.RenderOptions(background=(0.1, 0.2, 0.3)))
 
 
-@torch.no_grad()
-def rendered(baked: Baked, camera: nw.Camera) -> torch.Tensor:
-    """The image (H, W, 3) of a camera at the mean exposure."""
-    return baked.scene().render(camera)
-
-
 def bilinear(texels: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     """Texels (height, width, C) at places (..., 2), column and row; differentiable."""
     left, top = places.detach().floor().long().unbind(-1)
@@ -243,11 +238,12 @@ def decode_atlas(codes: torch.Tensor, scale: float) -> torch.Tensor:
     return (codes.float() - 128) * (scale / 127)
 
 
-def as_stored(baked: Baked) -> Baked:
+def as_stored(scene: BakedScene) -> BakedScene:
     """A baked scene with the colours that its files hold."""
-    picture, scale = encode_picture(baked.atlas)
+    picture, scale = encode_picture(scene.texels[..., :3])
     with Image.open(io.BytesIO(picture)) as image:
         codes = torch.from_numpy(np.array(image.convert("RGB")))
-    state = dict(baked.surfels.state_dict())
-    state["shN"] = torch.from_numpy(decode_harmonics(*encode_harmonics(baked.surfels))).to(state["shN"])
-    return replace(baked, surfels=nw.Surfels(state), atlas=decode_atlas(codes, scale).to(baked.atlas))
+    sh0, shN = present(scene.harmonics)
+    shN = torch.from_numpy(decode_harmonics(*encode_harmonics(shN))).to(shN)
+    texels = torch.nn.functional.pad(decode_atlas(codes, scale), (0, 1)).to(scene.texels)
+    return replace(scene, texels=texels, harmonics=(sh0, shN))
