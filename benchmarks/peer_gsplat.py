@@ -160,8 +160,7 @@ def train(
     }
     control = _Control(settings, count, stretch, extent, gaussians, optimizers)
     decay = 0.01 ** (1 / iterations)
-    gains, lens = (None, None) if calibration is None else (calibration.gains, calibration.exposures)
-    views = TrainingViews(scene.train, device, gains, lens)
+    views = TrainingViews(scene.train, device, calibration)
     order: list[int] = []
     for step in range(iterations):
         order = order or torch.randperm(len(views)).tolist()

@@ -19,7 +19,7 @@ from nexwarp.cameras.camera import Camera, visible_points
 from nexwarp.cameras.paths import between
 from nexwarp.data import Scene, View
 from nexwarp.machine import derived_seed
-from nexwarp.model.exposures import DECIMALS, Exposures
+from nexwarp.model.exposures import DECIMALS
 from nexwarp.model.graphs import MOST_GRAPHS, share_graphs, without_graphs
 from nexwarp.model.model import Model
 from nexwarp.model.options import Color
@@ -93,8 +93,7 @@ class TargetSource:
         # The state holds this source: a cycle would keep the memory of both until the garbage collector comes.
         self.state: TrainingState = weakref.proxy(state)
         self.scene, self.config, self.poses = state.scene, state.config, state.poses
-        gains, lens = (None, None) if calibration is None else (calibration.gains, calibration.exposures)
-        self.views = TrainingViews(self.scene.train, state.device, gains, lens)
+        self.views = TrainingViews(self.scene.train, state.device, calibration)
         self.background = self.config.background or self.scene.background or mean_color(self.scene.train, calibration)
         self.background_tensor = torch.tensor(self.background, dtype=torch.float32, device=state.device)
         self.generator, self.noise = state.generator, state.noise
@@ -111,15 +110,20 @@ class TargetSource:
     def make(self, index: int, number: int) -> Target:
         """Make the target of a step with view `index`, number `number` of the training."""
         config, iteration = self.config, self.state.iteration
-        target = self.with_depth(self.with_points(self.from_view(index), index), index)
-        target = dataclasses.replace(target, normals=config.normals_at(iteration))
+        target, jitter = self.from_view(index), None
+        places, expected = self._points_in(index)
         if config.depth_jitter > 0 and config.max_hits:
             hits = config.hits_at(iteration)
-            drawn = jitter_factors(target.camera, hits, config.depth_jitter, generator=self.noise)
-            target = dataclasses.replace(target, depth_jitter=drawn)
-        if self.poses is not None:
-            target = dataclasses.replace(target, view=torch.tensor([index], device=self.views.device))
-        return target
+            jitter = jitter_factors(target.camera, hits, config.depth_jitter, generator=self.noise)
+        return dataclasses.replace(
+            target,
+            places=places,
+            expected=expected,
+            depth=self._depth_in(index),
+            depth_jitter=jitter,
+            view=None if self.poses is None else torch.tensor([index], device=self.views.device),
+            normals=config.normals_at(iteration),
+        )
 
     def from_view(self, index: int) -> Target:
         """Make the target of a view: photo, background and mask."""
@@ -137,18 +141,17 @@ class TargetSource:
             return Target(camera, photo, background, exposure, counts=mask)
         return Target(camera, torch.where(mask[..., None], photo, background), background, exposure, empty=~mask)
 
-    def with_points(self, target: Target, index: int) -> Target:
-        """Add the points of view `index` to its target, where it has any and the depth loss counts."""
+    def _points_in(self, index: int) -> tuple[torch.Tensor, torch.Tensor] | tuple[None, None]:
+        """Return places and z-depths of the points that view `index` shows; None without any, or without their loss."""
         points = self.scene.train[index].points
         if self.config.losses.depth == 0 or self.config.max_hits == 0 or points is None:
-            return target
-        camera, device = target.camera, self.views.device
+            return None, None
+        camera, device = self.views.cameras[index], self.views.device
         if index not in self.points or self.poses is not None:  # a pose that moves sees them elsewhere
-            mask = target.counts if target.empty is None else ~target.empty
             with torch.no_grad():
                 moved = camera if self.poses is None else self.poses.camera(camera, index)
                 seen = moved.project(points.to(device))
-            visible = visible_points(*seen, camera.width, camera.height, mask)
+            visible = visible_points(*seen, camera.width, camera.height, self.views.mask(index))
             none = torch.zeros(0, dtype=torch.int64, device=device), torch.zeros(0, device=device)
             places, expected = none if visible is None else visible
             places, order = places.sort(stable=True)
@@ -157,17 +160,13 @@ class TargetSource:
             fill = (0, self._most_points - len(places) if device.type == "cuda" else 0)
             beyond, pad = camera.width * camera.height, torch.nn.functional.pad
             self.points[index] = pad(places, fill, value=beyond), pad(expected[order], fill)
-        places, expected = self.points[index]
-        return dataclasses.replace(target, places=places, expected=expected)
+        return self.points[index]
 
-    def with_depth(self, target: Target, index: int) -> Target:
-        """Add the depth map of view `index` to its target, where photos have any and their loss counts."""
+    def _depth_in(self, index: int) -> torch.Tensor | None:
+        """Return the depth map of view `index`, 0 where it is masked; None without any, or without its loss."""
         counted = self.config.losses.depth_maps > 0 and self.config.max_hits > 0
-        depth = self.views.depth(index) if counted else None
-        if depth is None:
-            return target
-        mask = target.counts if target.empty is None else ~target.empty
-        return dataclasses.replace(target, depth=depth if mask is None else depth * mask)
+        depth, mask = self.views.depth(index) if counted else None, self.views.mask(index)
+        return depth if depth is None or mask is None else depth * mask
 
     @cached_property
     def _most_points(self) -> int:
@@ -282,17 +281,11 @@ class TrainingViews:
     through pinned memory, without waiting for it.
     """
 
-    def __init__(
-        self,
-        views: list[View],
-        device: torch.device,
-        gains: torch.Tensor | None = None,
-        lens: Exposures | None = None,
-    ) -> None:
-        """Move the views, whose photos have gains (V, 3) and a lens's falloff or else one exposure, to a device."""
+    def __init__(self, views: list[View], device: torch.device, calibration: ExposureCalibration | None = None) -> None:
+        """Move the views, whose photos have the exposures of a calibration or else one exposure, to a device."""
         self.device = device
-        self.gains = None if gains is None else gains.to(device)
-        self.lens = None if lens is None else copy.deepcopy(lens).to(device)
+        self.gains = None if calibration is None else calibration.gains.to(device)
+        self.lens = None if calibration is None else copy.deepcopy(calibration.exposures).to(device)
         self.views = views
         self.cameras = [view.camera.to(device) for view in views]
         self.photos = [view.image for view in views]
