@@ -23,9 +23,8 @@ from typing import Any
 import warp as wp
 
 from nexwarp.kernels.types import func_per_real, ints, per_real
-from nexwarp.native.cells import merge_functions
+from nexwarp.native.cells import load_function, merge_functions
 from nexwarp.native.fixed_point import fixed_point_units
-from nexwarp.native.vector_loads import load_function
 
 PRIME_Y = wp.constant(wp.uint32(2654435761))
 PRIME_Z = wp.constant(wp.uint32(805459861))

@@ -1,9 +1,36 @@
-"""Sums over the points of a cell of the hash grid, and their addition to a table's rows."""
+"""Rows of the hash grid's tables: their loads, sums over the points of a cell, and the addition of these."""
 
 import functools
 from types import SimpleNamespace
 
 import warp as wp
+
+from nexwarp.native import snippet
+
+# Loads on a GPU, by the length of a row and its scalar.
+_LOADS = {
+    (4, wp.float32): """
+    const float4 v = __ldg(reinterpret_cast<const float4*>(&wp::index(table, level, slot)));
+    return wp::vec_t<4, float>(v.x, v.y, v.z, v.w);""",
+    (2, wp.float32): """
+    const float2 v = __ldg(reinterpret_cast<const float2*>(&wp::index(table, level, slot)));
+    return wp::vec_t<2, float>(v.x, v.y);""",
+    (4, wp.float16): """
+    const uint2 bits = __ldg(reinterpret_cast<const uint2*>(&wp::index(table, level, slot)));
+    wp::vec_t<4, wp::half> v;
+    v.c[0].u = (unsigned short)(bits.x & 0xffffu);
+    v.c[1].u = (unsigned short)(bits.x >> 16);
+    v.c[2].u = (unsigned short)(bits.y & 0xffffu);
+    v.c[3].u = (unsigned short)(bits.y >> 16);
+    return v;""",
+    (2, wp.float16): """
+    const unsigned bits = __ldg(reinterpret_cast<const unsigned*>(&wp::index(table, level, slot)));
+    wp::vec_t<2, wp::half> v;
+    v.c[0].u = (unsigned short)(bits & 0xffffu);
+    v.c[1].u = (unsigned short)(bits >> 16);
+    return v;""",
+}
+_LOAD = "return wp::index(table, level, slot);"
 
 # Atomics of two and of four floats exist from sm_90 on: as many fewer in the backward pass.
 _ADD = """
@@ -45,6 +72,17 @@ _MERGE = """
 #endif
     return value;
 """
+
+
+@functools.cache
+def load_function(length: int, scalar: type) -> wp.Function:
+    """Make the function that returns table[level, slot], a vector of scalars, in one load where one is known."""
+    row = wp.types.vector(length=length, dtype=scalar)
+
+    @wp.func_native(snippet(_LOADS.get((length, scalar), _LOAD), _LOAD))
+    def load(table: wp.array2d(dtype=row), level: wp.int32, slot: wp.int32) -> row: ...
+
+    return load
 
 
 @functools.cache

@@ -5,10 +5,15 @@ A float is a pair of 64-bit integers, its multiples of 2^-20 and what is left in
 sums NaN. A hash grid would take too much memory so: its terms share one scale, see `hashgrid`.
 """
 
+from __future__ import annotations
+
 import warp as wp
 
-from nexwarp.native import for_both_reals, snippet
+from nexwarp import native
+from nexwarp.native import snippet
 from nexwarp.native.warp import record_sum_snippet
+
+integers, flags = wp.array2d(dtype=wp.int64), wp.array(dtype=wp.int32)
 
 HIGH, LOW = 2.0**20, 2.0**60
 
@@ -58,48 +63,19 @@ _UNITS = f"""
 """
 
 
-@for_both_reals
-def fixed_point_record_sum(real: type) -> wp.Function:
+_RECORD = _PUT + "wp::int64* target = &wp::index(records, slot, 0);\n"
+
+
+@native.func_native(record_sum_snippet(_RECORD, "put(target + 2 * k, value);"))
+def fixed_point_record_sum(records: integers, slot: wp.int32, a: vec4, b: vec4, c: vec4, d: vec4, bad: flags):
     """Add the sum over all lanes of four vec4 to the 16 pairs of records[slot]."""
-    vec4 = wp.types.vector(length=4, dtype=real)
-    target = _PUT + "wp::int64* target = &wp::index(records, slot, 0);\n"
-
-    @wp.func_native(record_sum_snippet(real, target, "put(target + 2 * k, value);"))
-    def add_record(
-        records: wp.array2d(dtype=wp.int64),
-        slot: wp.int32,
-        a: vec4,
-        b: vec4,
-        c: vec4,
-        d: vec4,
-        bad: wp.array(dtype=wp.int32),
-    ): ...
-
-    return add_record
 
 
-@for_both_reals
-def fixed_point_add(real: type) -> wp.Function:
+@native.func_native(_PUT + "put(&wp::index(sums, slot, 0), x);")
+def fixed_point_add(sums: integers, slot: wp.int32, x: real, bad: flags):
     """Add a scalar to the pair sums[slot]."""
 
-    @wp.func_native(_PUT + "put(&wp::index(sums, slot, 0), x);")
-    def add_value(sums: wp.array2d(dtype=wp.int64), slot: wp.int32, x: real, bad: wp.array(dtype=wp.int32)): ...
 
-    return add_value
-
-
-@for_both_reals
-def fixed_point_units(real: type) -> wp.Function:
+@native.func_native(_UNITS)
+def fixed_point_units(sums: integers, row: wp.int32, column: wp.int32, value: real, scale: wp.float64, bad: flags):
     """Add a scalar times a scale, rounded, to sums[row, column]."""
-
-    @wp.func_native(_UNITS)
-    def add_units(
-        sums: wp.array2d(dtype=wp.int64),
-        row: wp.int32,
-        column: wp.int32,
-        value: real,
-        scale: wp.float64,
-        bad: wp.array(dtype=wp.int32),
-    ): ...
-
-    return add_units

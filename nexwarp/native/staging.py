@@ -5,11 +5,14 @@ record and the next, so that the compiler computes two at once. On a CPU a warp 
 reads the record itself.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 import warp as wp
 
-from nexwarp.native import for_both_reals, snippet
+from nexwarp import native
+from nexwarp.native import snippet
 from nexwarp.native.vector_loads import load_record
 
 # Of a CUDA block whose warps stage records.
@@ -19,7 +22,7 @@ BLOCK_DIM = 128
 # j + 1 reads row j. Rows of neighbouring slots are neighbours, so that writes meet no bank twice.
 _ROW = """
     struct __align__(16) Row { REAL x, y, z, w; };
-    __shared__ Row rows[4 * BLOCK_DIM];
+    __shared__ Row rows[4 * THREADS];
     Row* mine = rows + (threadIdx.x >> 5) * 128 + slot;
     if (step == 0) {
         mine[0] = {a.c[0], a.c[1], a.c[2], a.c[3]};
@@ -30,7 +33,7 @@ _ROW = """
     }
     const Row row = mine[32 * (step - 1)];
     return wp::vec_t<4, REAL>(row.x, row.y, row.z, row.w);
-"""
+""".replace("THREADS", str(BLOCK_DIM))
 _ROW_ITSELF = "return step == 0 ? a : records.data[4 * (size_t)i + step - 1];"
 
 _NAME = f"""
@@ -42,17 +45,10 @@ _NAME = f"""
 """
 
 
-@for_both_reals
-def _access(real: type) -> wp.Function:
-    vec4 = wp.types.vector(length=4, dtype=real)
-    kind = "float" if real is wp.float32 else "double"
-
-    @wp.func_native(snippet(_ROW.replace("REAL", kind).replace("BLOCK_DIM", str(BLOCK_DIM)), _ROW_ITSELF))
-    def access_row(
-        step: wp.int32, slot: wp.int32, a: vec4, b: vec4, n: vec4, c: vec4, records: wp.array2d(dtype=vec4), i: wp.int32
-    ) -> vec4: ...
-
-    return access_row
+@native.func_native(snippet(_ROW, _ROW_ITSELF))
+def _access(
+    step: wp.int32, slot: wp.int32, a: vec4, b: vec4, n: vec4, c: vec4, records: vec4_rows, i: wp.int32
+) -> vec4: ...
 
 
 @wp.func_native(snippet(_NAME, "return wp::vec_t<2, int>(i, place);"))

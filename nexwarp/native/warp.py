@@ -5,9 +5,12 @@ Walks use these to cull for all pixels of a warp at once, and backward passes to
 one surfel before any atomic.
 """
 
+from __future__ import annotations
+
 import warp as wp
 
-from nexwarp.native import for_both_reals, snippet
+from nexwarp import native
+from nexwarp.native import snippet
 
 # Pixels along a tile's side. A GPU's warps cull within their tile; on a CPU tiles alone do, so they are smaller there.
 TILE_SIZE, CPU_TILE_SIZE = 16, 8
@@ -104,14 +107,9 @@ def warp_max(x: wp.int32) -> wp.int32:
 _SUM = "for (int o = 16; o > 0; o >>= 1) x += __shfl_down_sync(0xffffffffu, x, o);"
 
 
-@for_both_reals
-def warp_sum(real: type) -> wp.Function:
+@native.func_native(snippet(_SUM) + "return x;")
+def warp_sum(x: real) -> real:
     """Return, in lane 0, the sum of x over all lanes."""
-
-    @wp.func_native(snippet(_SUM) + "return x;")
-    def warp_sum(x: real) -> real: ...
-
-    return warp_sum
 
 
 # In each step a lane hands over the half of its values that the other lane of a pair will own, and adds what it gets
@@ -136,7 +134,7 @@ _EXCHANGE = """
 _EXCHANGES = "".join(_EXCHANGE.replace("HALF", str(half)) for half in (8, 4, 2, 1))
 
 
-def record_sum_snippet(real: type, target: str, add: str) -> str:
+def record_sum_snippet(target: str, add: str) -> str:
     """C++ that sums four vec4, a to d, over all lanes; `add` adds the scalar `value` to the place `k` of `target`."""
     cuda = f"""
     const int lane = threadIdx.x & 31;
@@ -146,18 +144,13 @@ def record_sum_snippet(real: type, target: str, add: str) -> str:
     if (!(lane & 1)) {{ {add} }}
 """
     cpu = f"for (int k = 0; k < 16; ++k) {{ const REAL value = v[k]; {add} }}"
-    name = "float" if real is wp.float32 else "double"
-    return (_GATHER + target + snippet(cuda, cpu)).replace("REAL", name)
+    return _GATHER + target + snippet(cuda, cpu)
 
 
-@for_both_reals
-def warp_record_sum(real: type) -> wp.Function:
+_TARGET = "REAL* target = reinterpret_cast<REAL*>(records.data + 4 * (size_t)(unsigned)slot);\n"
+_ADD = "\n" + snippet("atomicAdd(target + k, value);", "target[k] += value;")
+
+
+@native.func_native(record_sum_snippet(_TARGET, _ADD))
+def warp_record_sum(records: vec4_rows, slot: wp.int32, a: vec4, b: vec4, c: vec4, d: vec4):
     """Add the sum over all lanes of four vec4 to the four of records[slot], (N, 4) contiguous."""
-    vec4 = wp.types.vector(length=4, dtype=real)
-    target = "REAL* target = reinterpret_cast<REAL*>(records.data + 4 * (size_t)(unsigned)slot);\n"
-    add = snippet("atomicAdd(target + k, value);", "target[k] += value;")
-
-    @wp.func_native(record_sum_snippet(real, target, "\n" + add))
-    def add_record(records: wp.array2d(dtype=vec4), slot: wp.int32, a: vec4, b: vec4, c: vec4, d: vec4): ...
-
-    return add_record
