@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from nexwarp.cameras.camera import LARGEST_DISTANCE
@@ -23,12 +24,14 @@ from nexwarp.errors import FormatError, check_range, check_version
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import READ_ERRORS, read_object, write_json
 from nexwarp.model.buffers import Buffers
-from nexwarp.model.crop import REGIONS, inside
+from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels, harmonics
+from nexwarp.model.texture import DetailLimits
 
 EDIT_FILE = "edit.json"
 EDIT_VERSION = 1
 REMOVE = "remove"  # numbers: a checksum of the trained surfels, and indices of some
+REGIONS = {"box": 6, "sphere": 4}  # numbers: lowest and highest corner; centre and radius; world units
 # Numbers: a rotation, row by row, and a shift; a factor; the new origin.
 MOVES = {"level": 12, "scale": 1, "origin": 3}
 SCALES = (1e-9, 1e9)
@@ -76,6 +79,13 @@ class Edit:
         return Similarity(np.reshape(self.numbers[:9], (3, 3)), np.array(self.numbers[9:]))
 
 
+def _inside(region: str, numbers: Sequence[float], points: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Return (N,) bool: which of (N, 3) points lie in a region, one of `REGIONS`, with its numbers."""
+    if region == "sphere":
+        return np.asarray(np.square(points - numbers[:3]).sum(axis=1) <= numbers[3] ** 2)
+    return np.asarray(((points >= numbers[:3]) & (points <= numbers[3:])).all(axis=1))
+
+
 def checksum(surfels: Surfels) -> int:
     """Return a checksum of the surfels' centres."""
     return zlib.crc32(surfels.means.detach().cpu().numpy().tobytes())
@@ -96,7 +106,7 @@ def kept_surfels(surfels: Surfels, edits: Sequence[Edit]) -> np.ndarray:
     kept = np.ones(len(means), bool)
     for number, edit in enumerate(edits):
         if edit.name in REGIONS:
-            kept &= inside(edit.name, edit.numbers, frame_of(edits[:number]).points(means))
+            kept &= _inside(edit.name, edit.numbers, frame_of(edits[:number]).points(means))
         elif edit.name == REMOVE and (edit.numbers[0] != checksum(surfels) or max(edit.numbers[1:]) >= len(kept)):
             raise ValueError(f"the model has changed since {edit}; take that back with nexwarp edit --undo")
         elif edit.name == REMOVE:
@@ -104,6 +114,15 @@ def kept_surfels(surfels: Surfels, edits: Sequence[Edit]) -> np.ndarray:
         if len(kept) and not kept.any():
             raise ValueError(f"expected edits that leave surfels, but {edit} leaves none of {len(kept):,}")
     return kept
+
+
+def select(model: Model, kept: torch.Tensor) -> Model:
+    """Return the model of those surfels for which `kept` (N,) is true; the rest of the model is shared."""
+    surfels = Surfels({name: value[kept] for name, value in model.surfels.state_dict().items()})
+    limits = model.detail_limits
+    if limits is not None:
+        limits = DetailLimits(limits.nearest[kept], limits.farthest[kept])
+    return Model(surfels, model.texture, model.exposures, limits, model.options, model.meta)
 
 
 def moved_poses(means: torch.Tensor, quats: torch.Tensor, motion: Similarity) -> tuple[torch.Tensor, torch.Tensor]:

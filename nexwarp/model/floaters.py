@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera, in_image
-from nexwarp.model.crop import select
+from nexwarp.model.edit import select
 from nexwarp.model.model import Model
 from nexwarp.model.render import Rendering
 from nexwarp.model.surfels import Surfels

@@ -14,8 +14,7 @@ from nexwarp.cameras.similarity import Similarity, upright
 from nexwarp.data.option import Flag_, option
 from nexwarp.errors import RunError, naming, require
 from nexwarp.export.bake import Progress
-from nexwarp.model.crop import REGIONS
-from nexwarp.model.edit import REMOVE, Edit, checksum, moved_surfels, write_edits
+from nexwarp.model.edit import REGIONS, REMOVE, Edit, checksum, moved_surfels, write_edits
 from nexwarp.model.floaters import find_floaters
 from nexwarp.run.folder import TRAIN, OpenedModel
 

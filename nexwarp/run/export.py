@@ -40,8 +40,7 @@ from nexwarp.export.web.export import Page, export_web, read_notes
 from nexwarp.io.files import one_line
 from nexwarp.io.json_files import JsonObject, write_json
 from nexwarp.model.compact import NOISE, NOISES
-from nexwarp.model.crop import REGIONS
-from nexwarp.model.edit import moved_poses, moved_surfels
+from nexwarp.model.edit import REGIONS, moved_poses, moved_surfels
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
 from nexwarp.model.texture import NeuralTexture

@@ -33,8 +33,7 @@ from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError, check_version
 from nexwarp.io.files import is_temporary, make_folders, one_line, remove_empty, sync, written_aside
 from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
-from nexwarp.model.crop import select
-from nexwarp.model.edit import EDIT_FILE, Edit, frame_of, kept_surfels, read_edits
+from nexwarp.model.edit import EDIT_FILE, Edit, frame_of, kept_surfels, read_edits, select
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, SUFFIX, load
 from nexwarp.train.checkpoint import CHECKPOINT_FILES, CHECKPOINTS
