@@ -586,17 +586,3 @@ def _kind(target: Any) -> Hashable:
         elif field.name != "camera":
             parts.append(value)
     return tuple(parts)
-
-
-def graph_key(
-    options: RenderOptions, optimizer: torch.optim.Optimizer, tensors: Sequence[torch.Tensor], *, densify: bool
-) -> GraphKey:
-    """Return the key of a step on `tensors`: the parameters and the sums that it adds to if `densify`."""
-    moments = [x for state in optimizer.state.values() for x in state.values() if isinstance(x, torch.Tensor)]
-    return GraphKey(
-        (densify, options.max_hits, options.sh_degree, torch.are_deterministic_algorithms_enabled()),
-        (
-            *((x.data_ptr(), x.shape) for x in (*tensors, *moments)),
-            *(group["lr"].data_ptr() for group in optimizer.param_groups),
-        ),
-    )

@@ -17,7 +17,7 @@ from torch import nn
 from nexwarp.data import Scene
 from nexwarp.errors import DivergedError, RankError, SceneError
 from nexwarp.machine import derived_seed, needed_memory
-from nexwarp.model.graphs import Gradients, GraphKey, StepResult, UpdateError, capturing
+from nexwarp.model.graphs import Gradients, StepResult, UpdateError, capturing
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import NeuralTexture, Texture
 from nexwarp.train.checkpoint import Snapshot
@@ -138,10 +138,6 @@ class ParallelTrainer(Trainer):
 
     def _trained(self) -> list[nn.Parameter]:
         return [x for group in self.optimizer.param_groups for x in group["params"]]
-
-    def _graph_key(self) -> GraphKey:
-        key = super()._graph_key()
-        return key._replace(kernels=(key.kernels, self.share))
 
     def check(self) -> None:
         """Raise DivergedError, the same on all ranks, unless all numbers are finite; RankError where ranks differ."""

@@ -14,7 +14,7 @@ from nexwarp.data import Scene
 from nexwarp.errors import CheckpointError, OutOfMemoryError, SceneError
 from nexwarp.io.files import one_line
 from nexwarp.machine import deterministic, needed_memory, seed_everything, torch_threads
-from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, graph_key, updating
+from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, updating
 from nexwarp.model.model import Model
 from nexwarp.model.render import draw
 from nexwarp.train.checkpoint import Snapshot, load_checkpoint, save_checkpoint
@@ -191,9 +191,20 @@ class Trainer(TrainingState):
         return self.densifier.unneeded(self.model(), self.views.refined_cameras(self.poses))
 
     def _graph_key(self) -> GraphKey:
-        tensors = [self.densifier.errors, *(parameter for _, parameter in self._named_parameters())]
-        key = graph_key(self.render_options(), self.optimizer, tensors, densify=self.densifier.active(self.iteration))
-        return key._replace(kernels=(key.kernels, self.texture.half_copy_key()))
+        options, groups = self.render_options(), self.optimizer.param_groups
+        moments = [x for state in self.optimizer.state.values() for x in state.values() if isinstance(x, torch.Tensor)]
+        tensors = [self.densifier.errors, *(parameter for _, parameter in self._named_parameters()), *moments]
+        return GraphKey(
+            kernels=(
+                self.densifier.active(self.iteration),
+                options.max_hits,
+                options.sh_degree,
+                torch.are_deterministic_algorithms_enabled(),
+                self.texture.half_copy_key(),
+                self.share,
+            ),
+            tensors=(*((x.data_ptr(), x.shape) for x in tensors), *(group["lr"].data_ptr() for group in groups)),
+        )
 
     def finish(self, observe: FinishObserver = lambda *_: None) -> Model:
         """Return a finished model of new surfels and the trainer's texture: smooth SH, detail limits, exposures."""
