@@ -55,10 +55,10 @@ class Look:
     rendering: Rendering
     pixels: torch.Tensor  # (P,) int64, row * width + column of the ray camera
     places: torch.Tensor  # (P, 2) their x and y in the face, -1 and 1 at its borders
-    lengths: torch.Tensor  # (P,) length along the face's axis of their rays' vectors
 
-    def sampled(self, values: torch.Tensor, mode: str) -> torch.Tensor:
-        """Return values (side, side, ...) at the places, (P, ...), `mode` being bilinear or nearest."""
+    def sampled(self, name: str, mode: str) -> torch.Tensor:
+        """Return a buffer of the rendering at the places, (P, ...), `mode` being bilinear or nearest."""
+        values = getattr(self.rendering, name)
         channels = values.flatten(2) if values.ndim > 2 else values[..., None]
         if not channels.shape[2]:
             return values.new_zeros(len(self.pixels), *values.shape[2:])
@@ -89,26 +89,22 @@ class RayRendering(Rendering):
 class FaceBuffers:
     """Buffers of a ray camera, by the name of a property of `Rendering`."""
 
-    camera: RayCamera
+    lengths: torch.Tensor  # (H, W) of the rays' vectors, along the axes of their faces; 0 where there is no ray
     looks: list[Look]
 
     def values(self, name: str, mode: str, empty: Any = 0) -> torch.Tensor:
         """Return a buffer (H, W, ...), with `empty` where there is no ray."""
-        parts = [look.sampled(getattr(look.rendering, name), mode) for look in self.looks]
-        return self._gathered(parts, empty)
+        parts = [look.sampled(name, mode) for look in self.looks]
+        whole = parts[0].new_zeros(self.lengths.numel(), *parts[0].shape[1:]) + torch.as_tensor(empty).to(parts[0])
+        for look, part in zip(self.looks, parts, strict=True):
+            whole[look.pixels] = part
+        return whole.view(*self.lengths.shape, *whole.shape[1:])
 
     def depths(self, name: str) -> torch.Tensor:
         """Return depths (H, W, ...) in units of the pixels' rays."""
-        parts = [look.sampled(getattr(look.rendering, name), "nearest") for look in self.looks]
-        lengths = (look.lengths.view(-1, *(1,) * (x.ndim - 1)) for x, look in zip(parts, self.looks, strict=True))
-        return self._gathered([x / length for x, length in zip(parts, lengths, strict=True)], 0)
-
-    def _gathered(self, parts: list[torch.Tensor], empty: Any) -> torch.Tensor:
-        height, width = self.camera.height, self.camera.width
-        whole = parts[0].new_zeros(height * width, *parts[0].shape[1:]) + torch.as_tensor(empty).to(parts[0])
-        for look, part in zip(self.looks, parts, strict=True):
-            whole[look.pixels] = part
-        return whole.view(height, width, *whole.shape[1:])
+        values = self.values(name, "nearest")
+        lengths = self.lengths.where(self.lengths > 0, 1.0)
+        return values / (lengths if values.ndim == 2 else lengths[..., None])
 
 
 @torch.no_grad()
@@ -129,11 +125,11 @@ def draw_faces(
     looks = []
     for index in faces[lengths > 0].unique().tolist() or [0]:
         face, pixels = Face(camera, facings[index]), ((faces == index) & (lengths > 0)).nonzero()[:, 0]
-        x, y, z = (rays[pixels] @ facings[index].T).unbind(-1)
-        places = torch.stack([x, y], -1) / z[:, None] * (face.fx / (face.width / 2))
+        turned = rays[pixels] @ facings[index].T
+        places = turned[:, :2] / turned[:, 2:] * (face.fx / (face.width / 2))
         rendering = draw(surfels, texture, face, options, background=background, **rest)
-        looks.append(Look(rendering, pixels, places, z))
-    buffers = FaceBuffers(camera, looks)
+        looks.append(Look(rendering, pixels, places))
+    buffers = FaceBuffers(lengths.view(camera.height, camera.width), looks)
     gains = exposures if options.exposure == "photos" else None
     factors = 1.0 if gains is None else gains.factors(camera)
     image = buffers.values("image", "bilinear", background) * factors
