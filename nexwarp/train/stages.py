@@ -199,8 +199,8 @@ class StageRunner:
             self.trainer = ParallelTrainer(self.scene, self.stage.config, self.device, self.ranks, **options)
         self.store.begin(self.stage, self.trainer)
 
-    def train_teachers(self) -> None:
-        """Train and finish the teachers; the student's trainer is then before its first step."""
+    def train(self) -> None:
+        """Do all steps that are left of the run; teachers, which come first, are finished."""
         while self.stage.teacher:
             try:
                 self.store.train(self.stage, self.trainer)
@@ -210,10 +210,6 @@ class StageRunner:
             self.models.append(self.store.finish(self.stage, self.trainer))
             del self.trainer  # before the next one takes memory
             self._begin()
-
-    def train(self) -> None:
-        """Do all steps that are left of the run, those of teachers first."""
-        self.train_teachers()
         self.store.train(self.stage, self.trainer)
 
     def finish(self) -> Model:
