@@ -11,7 +11,7 @@ from typing import TypedDict, TypeVar
 
 import torch
 from torch import nn
-from typing_extensions import Unpack
+from typing_extensions import NotRequired
 
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
@@ -118,15 +118,8 @@ def registered_texture(name: str) -> type[Texture] | None:
     return _REGISTERED.get(name)
 
 
-class TextureFlags(TypedDict, total=False):
-    """Arguments of `NeuralTexture` that files of nexwarp 0.1 do not have."""
-
-    residual: bool
-    down_weighting: bool
-
-
-class TextureShape(TextureFlags):
-    """Arguments of `NeuralTexture`, as a model file keeps them."""
+class TextureShape(TypedDict):
+    """Arguments of `NeuralTexture`, as a model file keeps them; those of nexwarp 0.1 do not have the flags."""
 
     levels: int
     table_size: int
@@ -136,6 +129,8 @@ class TextureShape(TextureFlags):
     width: int
     hidden_layers: int
     sh_degree: int
+    residual: NotRequired[bool]
+    down_weighting: NotRequired[bool]
 
 
 class NeuralTexture(Texture):
@@ -156,7 +151,7 @@ class NeuralTexture(Texture):
     # The grid in half precision, and which grid it was: address and version.
     _half_copy: tuple[torch.Tensor, tuple[int, int]] | None = None
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  # the settings that a model file keeps
         self,
         levels: int = 16,
         table_size: int = 2**20,
@@ -166,7 +161,8 @@ class NeuralTexture(Texture):
         width: int = 64,
         hidden_layers: int = 2,
         sh_degree: int = 3,
-        **flags: Unpack[TextureFlags],
+        residual: bool = False,
+        down_weighting: bool = True,
     ) -> None:
         """Make a field with initial values.
 
@@ -179,9 +175,9 @@ class NeuralTexture(Texture):
             width: width of the hidden layers.
             hidden_layers: number of hidden layers.
             sh_degree: SH degree of the output, 0 to 3: (sh_degree + 1)^2 coefficients of three channels.
-            flags: residual: add the texture's colours to the surfels' plain colours instead of replacing them; where no
-                photo trained the field it is 0, and the plain colours remain; False by default. down_weighting:
-                down-weight levels whose cells are smaller than a pixel (Delta, paper Eq. 4); True by default.
+            residual: add the texture's colours to the surfels' plain colours instead of replacing them; where no photo
+                trained the field it is 0, and the plain colours remain.
+            down_weighting: down-weight levels whose cells are smaller than a pixel (Delta, paper Eq. 4).
 
         Raises:
             TypeError, ValueError: the message names the argument.
@@ -190,9 +186,9 @@ class NeuralTexture(Texture):
         check_sizes(levels, table_size, features, width, hidden_layers, sh_degree)
         check_number("min_resolution", min_resolution, 1e-30, LARGEST_RESOLUTION)
         check_number("max_resolution", max_resolution, min_resolution, LARGEST_RESOLUTION)
-        for name, flag in flags.items():
-            if name not in TextureFlags.__annotations__ or not isinstance(flag, bool):
-                raise TypeError(f"{name}: expected residual or down_weighting, True or False, got {flag!r}")
+        for name, flag in (("residual", residual), ("down_weighting", down_weighting)):
+            if not isinstance(flag, bool):
+                raise TypeError(f"{name}: expected True or False, got {flag!r:.60}")
         self.config = {
             "levels": levels,
             "table_size": table_size,
@@ -202,11 +198,10 @@ class NeuralTexture(Texture):
             "width": width,
             "hidden_layers": hidden_layers,
             "sh_degree": sh_degree,
-            "residual": flags.get("residual", False),
-            "down_weighting": flags.get("down_weighting", True),
+            "residual": residual,
+            "down_weighting": down_weighting,
         }
-        self.sh_degree = sh_degree
-        self.residual, self.down_weighting = self.config["residual"], self.config["down_weighting"]
+        self.sh_degree, self.residual, self.down_weighting = sh_degree, residual, down_weighting
         self.half_precision = True
         self.grid = nn.Parameter(torch.full((levels, table_size, features), GRID_INIT))
         self.register_buffer("resolutions", _geometric_series(min_resolution, max_resolution, levels))
