@@ -4,11 +4,12 @@ import io
 import os
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import torch
@@ -35,6 +36,9 @@ EXIF_ERRORS = (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.err
 EXR, DEEP = ".exr", (".png", ".tif", ".tiff")  # suffixes of files of linear light, and of those of up to 16 bits
 COPY_QUALITY = 97  # of upright copies of JPEG files
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
 
 @cache
 def decodable_formats() -> list[str]:
@@ -58,6 +62,24 @@ def quiet_pillow() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         yield
+
+
+def read_in_threads(
+    read: Callable[[Item], Result],
+    items: Sequence[Item],
+    threads: int,
+    done: Callable[[int], None] = lambda count: None,
+) -> list[Result]:
+    """Return what `read` returns of each item; decoding frees the GIL. `done` is called with the number of them.
+
+    An error ends the reading: items that wait are left.
+    """
+    results = []
+    with ThreadPoolExecutor(threads) as pool:
+        for result in pool.map(read, items):
+            results.append(result)
+            done(len(results))
+    return results
 
 
 class _Bounded(io.BufferedReader):

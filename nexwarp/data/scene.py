@@ -6,12 +6,11 @@ import os
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -33,7 +32,7 @@ from nexwarp.data.capture import (
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.depth_files import with_depths
 from nexwarp.data.depth_fit import fit_depths
-from nexwarp.data.images import EXR, quiet_pillow
+from nexwarp.data.images import EXR, quiet_pillow, read_in_threads
 from nexwarp.data.in_memory import as_bytes, make_cloud, near_origin, split_views
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.ply import read_ply
@@ -65,8 +64,6 @@ SHARE = 0.9  # largest share of the free memory for photos
 MAX_DOWNSCALE = 64  # that a message names
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 ProgressCallback = Callable[[int, int], None]
 
 
@@ -132,7 +129,7 @@ class SceneSource:
 
     def load(self, progress: ProgressCallback | None = None) -> "Scene":
         """Read the scene; progress and errors are those of `load_scene`."""
-        return _read_scene(self, self._folder(), progress)
+        return _read_scene(self, self._folder(), progress or (lambda done, total: None))
 
     def photos(self) -> list[Photo]:
         """Read the photos' names, files and lenses, without pixels; errors are those of `load_scene`."""
@@ -332,7 +329,7 @@ def _check_types(source: SceneSource) -> None:
             raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}")
 
 
-def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback | None) -> Scene:
+def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback) -> Scene:
     """Read the scene of a source whose folder is `path`."""
     if source.downscale < 1:
         raise ValueError(f"downscale: expected at least 1, got {source.downscale}")
@@ -416,20 +413,22 @@ def _read_views(
     tests: list[bool],
     background: tuple[float, float, float] | None,
     near: float,
-    progress: ProgressCallback | None,
+    progress: ProgressCallback,
 ) -> tuple[list[View], list[View]]:
     """Read all photos; return the training views and the test views."""
     alpha_mask = source.masks == ALPHA
     reader = ViewReader(source.downscale, background, alpha_mask, source.linear)
     photos = with_depths(path, _with_masks(path, capture.photos, source.masks))
     photos = [dataclasses.replace(x, depth=None) if test else x for x, test in zip(photos, tests, strict=True)]
-    plans = _map(reader.plan, photos, MAX_READERS)
+    plans = read_in_threads(reader.plan, photos, MAX_READERS)
     jobs = [job for plan in plans for job in plan]
     channels = 3 + (background is not None) + (alpha_mask or any(job.photo.mask for job in jobs))
     channels += DEPTH_BYTES * any(job.photo.depth for job in jobs)
     workers = _workers(source, path, channels, jobs)
     x, y, z = capture.origin.tolist()
-    views = _map(lambda job: reader.read(job, near, (x, y, z)), jobs, workers, progress)
+    views = read_in_threads(
+        lambda job: reader.read(job, near, (x, y, z)), jobs, workers, lambda done: progress(done, len(jobs))
+    )
     held_out = [test for plan, test in zip(plans, tests, strict=True) for _ in plan]
     train = [view for view, test in zip(views, held_out, strict=True) if not test]
     return train, [view for view, test in zip(views, held_out, strict=True) if test]
@@ -587,19 +586,6 @@ def _workers(source: SceneSource, path: Path, channels: int, jobs: list[PlannedV
         for job in jobs
     )
     return max(1, min(MAX_READERS, (os.cpu_count() or 1) + 4, (free - need) // (2 * largest)))
-
-
-def _map(
-    function: Callable[[Item], Result], items: Sequence[Item], workers: int, progress: ProgressCallback | None = None
-) -> list[Result]:
-    """Apply a function in threads: decoding frees the GIL."""
-    results = []
-    with ThreadPoolExecutor(workers) as pool:
-        for result in pool.map(function, items):
-            results.append(result)
-            if progress is not None:
-                progress(len(results), len(items))
-    return results
 
 
 def _thinned(cloud: Cloud) -> Cloud:

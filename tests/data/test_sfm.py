@@ -154,15 +154,15 @@ def test_the_mapper_that_registers_more_is_taken(mapper, incremental, everywhere
         counts = [dict.fromkeys(("num_reg_images.return_value", "num_points3D.return_value"), n) for n in found]
         return {index: Mock(**count) for index, count in enumerate(counts)}
 
-    monkeypatch.setattr(Stages, "_incrementally", lambda self, done: answer(incremental))
-    monkeypatch.setattr(Stages, "_globally", lambda self: answer(everywhere))
-    stages = Stages(tmp_path, tmp_path, SfmOptions(mapper=mapper), lambda *_: None)
+    monkeypatch.setattr(Stages, "_incrementally", lambda self, stage: answer(incremental))
+    monkeypatch.setattr(Stages, "_globally", lambda self, stage: answer(everywhere))
+    stages, stage = Stages(tmp_path, tmp_path, SfmOptions(mapper=mapper), lambda *_: None), Mock()
     overlaps = Overlaps({str(i): 900 for i in range(7)}, {}, 21, False)
     if isinstance(expected, str):
         with pytest.raises(ValueError, match=expected):
-            stages._map(overlaps, lambda _: None)
+            stages._map(overlaps, stage)
     else:
-        models, used = stages._map(overlaps, lambda _: None)
+        models, used = stages._map(overlaps, stage)
         assert (models[0].num_reg_images(), used) == expected
 
 

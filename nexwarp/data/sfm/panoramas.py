@@ -16,6 +16,8 @@ from nexwarp.io.pictures import save_jpeg, save_png
 
 if TYPE_CHECKING:
     import pycolmap
+else:
+    pycolmap = pycolmap_module()
 
 FOLDER, FRONT = "panorama_{}", "front"  # folder of the views of a face
 STEP = 8  # rows, of which one is looked at
@@ -65,9 +67,8 @@ def view_groups(photos: Sequence[InputPhoto]) -> list[list[InputPhoto]]:
     return [known[face :: len(FACES)] for face in range(len(FACES) if known else 0)]
 
 
-def rig() -> "pycolmap.RigConfig":
+def rig() -> pycolmap.RigConfig:
     """How the views of a panorama lie around its centre."""
-    pycolmap = pycolmap_module()
     config = pycolmap.RigConfig()
     config.cameras = [
         pycolmap.RigConfigCamera(

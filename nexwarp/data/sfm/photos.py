@@ -6,7 +6,6 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -21,6 +20,7 @@ from nexwarp.data.images import (
     image_size,
     is_turned,
     read_image,
+    read_in_threads,
 )
 from nexwarp.data.lens import pycolmap_module
 from nexwarp.data.scene import GIB, SHARE
@@ -128,22 +128,19 @@ def read_photos(
     pycolmap. `done` is called with the number of photos that were read. ValueError: fewer than 3 photos are left, or,
     if `strict`, one cannot be read.
     """
-    photos: list[InputPhoto] = []
-    skipped: dict[str, str] = {}
-    with ThreadPoolExecutor(threads) as pool:  # decoding releases the GIL
-        jobs = {name: pool.submit(_read_photo, folder, name, prepared) for name in names}
+
+    def read(name: str) -> InputPhoto | str:
+        """Return a photo, or the reason why it cannot be read."""
         try:
-            for count, (name, job) in enumerate(jobs.items(), start=1):
-                try:
-                    photos.append(job.result())
-                except ValueError as error:
-                    if strict or isinstance(error.__cause__, MemoryError):
-                        raise
-                    skipped[name] = str(error).removeprefix(f"{folder / name}: ")
-                done(count)
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+            return _read_photo(folder, name, prepared)
+        except ValueError as error:
+            if strict or isinstance(error.__cause__, MemoryError):
+                raise
+            return str(error).removeprefix(f"{folder / name}: ")
+
+    results = dict(zip(names, read_in_threads(read, names, threads, done), strict=True))
+    photos = [photo for photo in results.values() if isinstance(photo, InputPhoto)]
+    skipped = {name: reason for name, reason in results.items() if isinstance(reason, str)}
     if skipped and len(photos) < MIN_PHOTOS:
         name, reason = next(iter(skipped.items()))
         there = f"{len(photos) or 'none'} of {len(names)}; {name}: {reason}"

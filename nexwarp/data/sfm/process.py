@@ -23,8 +23,7 @@ from subprocess import PIPE
 
 from nexwarp.data.sfm.frames import check_frames, take_frames
 from nexwarp.data.sfm.photos import SECOND, list_photos
-from nexwarp.data.sfm.report import SfmOptions, SfmReport
-from nexwarp.data.sfm.stages import PYCOLMAP, Observer, Stages
+from nexwarp.data.sfm.report import PYCOLMAP, Observer, SfmOptions, SfmReport
 from nexwarp.errors import OutOfMemoryError, SceneError, StorageError
 from nexwarp.io.files import make_folders, one_line, remove_empty
 from nexwarp.io.json_files import Json, write_json
@@ -211,6 +210,8 @@ def _end_with_parent(folder: Path) -> None:
 
 def _make(order: Order, observe: Observer) -> SfmReport:
     """Make folder/scene of the photos, or of frames of the video, and return the report."""
+    from nexwarp.data.sfm.stages import Stages  # which imports pycolmap
+
     source, names, options, choice = order.source, order.photos, order.options, None
     if not order.photos:
         photos = order.folder / "frames"

@@ -1,7 +1,7 @@
 """The settings and the report of a reconstruction: registered photos, reasons for the others, advice."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, get_args
 
@@ -16,6 +16,9 @@ CameraModel = Literal[
 ]
 Matching = Literal["auto", "exhaustive", "sequential"]
 Mapper = Literal["auto", "incremental", "global"]
+
+Observer = Callable[[str, int, int], None]  # takes a stage's title, the number of its items that are done, and of all
+PYCOLMAP = "pycolmap failed"  # in messages
 
 EXHAUSTIVE_UP_TO = 150  # photos: 11,175 pairs, a quarter of an hour on two cores
 FEW_FEATURES = 500  # a photo
