@@ -269,9 +269,8 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     scale = height / camera.height
     fx, fy, cy = (number * scale for number in (camera.fx, camera.fy, camera.cy))
     cx = (camera.cx - camera.width / 2) * scale + width / 2
-    K = camera.K.clone()
-    K[0, 0], K[1, 1], K[0, 2], K[1, 2] = fx, fy, cx, cy
-    fx, fy, cx, cy = torch.tensor([fx, fy, cx, cy], dtype=K.dtype).tolist()  # as K has them, which may be on a GPU
+    K = camera.K.new_tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])  # one copy to a GPU
+    fx, fy, cx, cy = torch.tensor([fx, fy, cx, cy], dtype=K.dtype).tolist()  # as K has them
     checked = (fx, fy, cx, cy) if min(fx, fy) >= SMALLEST_FOCAL and math.isfinite(fx + fy + cx + cy) else None
     return replace(camera, K=K, width=width, height=height, checked=checked)
 

@@ -9,9 +9,11 @@ from typing import TypedDict, cast
 import numpy as np
 import torch
 
+from nexwarp.cameras.camera import in_image
 from nexwarp.data import InitialPoints, Scene, View, initial_points
 from nexwarp.data.skybox import skybox_points
 from nexwarp.kernels.sh import BAND_0
+from nexwarp.machine import in_threads
 from nexwarp.model.bounds import check_bounds
 from nexwarp.model.model import Model
 from nexwarp.model.poses import PoseCorrections
@@ -213,14 +215,14 @@ def _table_size(scene: Scene, width: int) -> int:
 
 def _pixel_resolution(scene: Scene) -> float:
     """95th percentile, over training views and the points in them, of pixels per world unit."""
-    densities = []
-    for view in scene.train:
+
+    def densities(view: View) -> torch.Tensor:
         camera = view.camera
         pixel, depth = camera.project(scene.points)
-        size = torch.tensor([camera.width, camera.height])
-        seen = (depth > camera.near) & ((pixel >= 0) & (pixel < size)).all(dim=1)
-        densities.append(camera.focal / depth[seen])
-    density = torch.cat(densities)
+        seen = in_image(pixel, depth, camera.width, camera.height) & (depth > camera.near)
+        return camera.focal / depth[seen]
+
+    density = torch.cat(list(in_threads(densities, scene.train)))
     if density.numel() == 0:
         raise ValueError(f"{scene.path}: expected points in front of the training cameras, found none")
     return float(np.quantile(density.numpy(), 0.95))

@@ -18,7 +18,7 @@ import torch
 from nexwarp.cameras.camera import Camera, visible_points
 from nexwarp.cameras.paths import between
 from nexwarp.data import Scene, View
-from nexwarp.machine import derived_seed
+from nexwarp.machine import derived_seed, in_threads
 from nexwarp.model.exposures import DECIMALS
 from nexwarp.model.graphs import MOST_GRAPHS, share_graphs, without_graphs
 from nexwarp.model.model import Model
@@ -361,13 +361,17 @@ def with_cameras(views: Sequence[View], cameras: Sequence[Camera]) -> list[View]
 
 def mean_color(views: list[View], calibration: ExposureCalibration | None = None) -> tuple[float, float, float]:
     """Mean sRGB colour in [0, 1] of all pixels of the photos, each divided by its exposure."""
-    total, pixels = torch.zeros(3, dtype=torch.float64), 0
-    for index, view in enumerate(views):
-        light = None if calibration is None else calibration.exposures.falloff_of(view.camera)
-        # Integers have the same sum whatever the number of threads; rounding hides the order of the others.
-        sums = view.image.sum((0, 1), dtype=torch.int64) if light is None else (view.image / light.double()).sum((0, 1))
-        total += sums if calibration is None else sums / calibration.gains[index].double()
-        pixels += view.image.shape[0] * view.image.shape[1]
+
+    def light(numbered: tuple[int, View]) -> torch.Tensor:
+        index, view = numbered
+        falloff = None if calibration is None else calibration.exposures.falloff_of(view.camera)
+        values = view.image if falloff is None else view.image / falloff.double()
+        # Integers have the same sum in any order; rounding hides that of the others.
+        sums = values.sum((0, 1), dtype=torch.float64)
+        return sums if calibration is None else sums / calibration.gains[index].double()
+
+    total = sum(in_threads(light, enumerate(views)), torch.zeros(3, dtype=torch.float64))
+    pixels = sum(view.image.shape[0] * view.image.shape[1] for view in views)
     mean = total / pixels / 255
     red, green, blue = (mean if calibration is None else mean.clamp(0, 1).round(decimals=DECIMALS)).tolist()
     return red, green, blue
