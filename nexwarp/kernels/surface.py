@@ -29,15 +29,16 @@ from __future__ import annotations
 
 import warp as wp
 
+from nexwarp.kernels.collect import alpha_if_near
 from nexwarp.kernels.collect_backward import add
-from nexwarp.kernels.surfel import facing_side, hit, hit_alpha, hit_gradients, record_gradients
+from nexwarp.kernels.surfel import facing_side, hit, hit_gradients, record_gradients
 from nexwarp.kernels.types import FixedSums, TileLists, ints, per_real
-from nexwarp.kernels.walk import block_of, candidate, overflowed, pixel_of, tile_of, walk
-from nexwarp.native.vector_loads import load_record
-from nexwarp.native.warp import any_in_warp, ballot, from_lane, lane_index, lowest_lane, warp_max, warp_size
+from nexwarp.kernels.walk import block_of, overflowed, pixel_of, stage, tile_of, walk
+from nexwarp.native.staging import BLOCK_DIM, staged_name, staged_record
+from nexwarp.native.warp import any_in_warp, lane_index, warp_max, warp_size
 
 
-@per_real(grid_stride=False, fast_math=True)
+@per_real(grid_stride=False, fast_math=True, launch_bounds=BLOCK_DIM)
 def surface(first: int, surfels: Surfels, lists: TileLists, view: View, stops: ints, surface: Surface):
     thread = first + wp.tid()
     xy, inside, d = pixel_of(thread, view)
@@ -59,25 +60,24 @@ def surface(first: int, surfels: Surfels, lists: TileLists, view: View, stops: i
     lane = lane_index()
     last = wp.min(warp_max(stop), bounds[1])
     for batch in range(bounds[0], last, width):
-        mine = candidate(batch + lane, last, surfels, lists, overflow, middle, half)
-        left = ballot(wp.where(mine >= 0, 1, 0))
-        while left != 0:
-            source = lowest_lane(left)
-            left = left & (left - 1)
-            i = from_lane(mine, source)
-            if batch + source < stop:
-                a, b, n, c = load_record(surfels.records, i)
+        staged = stage(batch + lane, last, surfels, lists, overflow, middle, half)
+        for slot in range(staged[0]):
+            name = staged_name(slot, staged[1], batch)
+            i = name[0]
+            k = name[1]
+            if k < stop:
+                a, b, n, c = staged_record(slot, surfels.records, i)
                 u, v, depth = hit(a, b, n, c[3], d)
-                alpha = hit_alpha(a, b, n, u, v, surfels.limits[i])
+                alpha = alpha_if_near(u, v, surfels.limits[i], a[3], b[3], n[3])
                 if alpha >= ALPHA_MIN and depth > view.near:
                     weight = alpha * transmittance
                     if transmittance > HALF:
                         median_depth = depth
-                        pick[0] = batch + source
+                        pick[0] = k
                     if weight > heaviest:
                         heaviest = weight
                         top_depth = depth
-                        pick[1] = batch + source
+                        pick[1] = k
                     normals += vec3(n[0], n[1], n[2]) * (facing_side(n, d) * weight)
                     total += weight
                     depths += weight * depth
@@ -96,7 +96,7 @@ def surface(first: int, surfels: Surfels, lists: TileLists, view: View, stops: i
         surface.picks[p] = pick
 
 
-@per_real("fixed_point", "by_place", grid_stride=False, fast_math=True)
+@per_real("fixed_point", "by_place", grid_stride=False, fast_math=True, launch_bounds=BLOCK_DIM)
 def surface_backward(
     first: int,
     surfels: Surfels,
@@ -129,16 +129,14 @@ def surface_backward(
     lane = lane_index()
     last = wp.min(warp_max(stop), bounds[1])
     for batch in range(bounds[0], last, width):
-        mine = candidate(batch + lane, last, surfels, lists, overflow, middle, half)
-        left = ballot(wp.where(mine >= 0, 1, 0))
-        while left != 0:
-            source = lowest_lane(left)
-            left = left & (left - 1)
-            i = from_lane(mine, source)
-            k = batch + source
-            a, b, n, c = load_record(surfels.records, i)
+        staged = stage(batch + lane, last, surfels, lists, overflow, middle, half)
+        for slot in range(staged[0]):
+            name = staged_name(slot, staged[1], batch)
+            i = name[0]
+            k = name[1]
+            a, b, n, c = staged_record(slot, surfels.records, i)
             u, v, depth = hit(a, b, n, c[3], d)
-            alpha = hit_alpha(a, b, n, u, v, surfels.limits[i])
+            alpha = alpha_if_near(u, v, surfels.limits[i], a[3], b[3], n[3])
             if not (k < stop and alpha >= ALPHA_MIN and depth > view.near):
                 alpha = ZERO
             if any_in_warp(wp.where(alpha > ZERO, 1, 0)) != 0:

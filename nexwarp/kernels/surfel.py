@@ -13,7 +13,7 @@ is no division by m: a surfel seen edge-on through its centre stays finite. Its 
 
 import warp as wp
 
-from nexwarp.kernels.shape import alpha_at, alpha_gradients, far_outside
+from nexwarp.kernels.shape import alpha_gradients
 from nexwarp.kernels.types import Mat33, Mat44, Real, Vec2, Vec3, Vec4, Vec7
 
 
@@ -82,15 +82,6 @@ def hit(a: Vec4, b: Vec4, n: Vec4, m: Real, d: Vec2):
     """(u, v, t) where a ray meets the surfel's plane."""
     inverse = type(m)(1.0) / along(n, d)
     return along(a, d) * inverse, along(b, d) * inverse, m * inverse
-
-
-@wp.func
-def hit_alpha(a: Vec4, b: Vec4, n: Vec4, u: Real, v: Real, limit: Real):
-    """Opacity at (u, v), sparing the exponentials where they are certainly not needed."""
-    alpha = type(u)(0.0)
-    if not far_outside(u, v, limit):
-        alpha = alpha_at(u, v, a[3], b[3], n[3])
-    return alpha
 
 
 @wp.func

@@ -125,21 +125,17 @@ def misses_block(i: int, surfels: Surfels, d: Vec2, half: Vec2):
 
 
 @wp.func
-def candidate(k: int, end: int, surfels: Surfels, lists: TileLists, overflow: wp.bool, middle: Vec2, half: Vec2):
-    """Surfel at place k of the walk; -1 behind its end, and on CUDA where the surfel misses the whole block."""
+def stage(k: int, end: int, surfels: Surfels, lists: TileLists, overflow: wp.bool, middle: Vec2, half: Vec2):
+    """Stage the surfels at the lanes' places k before the walk's end, on CUDA but those that miss the whole block.
+
+    Return (number of surfels staged, this lane's surfel, -1 if it is not staged).
+    """
     i = int(-1)
     if k < end:
         i = surfel_at(k, lists, overflow)
         if warp_size() > 1:
             if misses_block(i, surfels, middle, half):
                 i = int(-1)
-    return i
-
-
-@wp.func
-def stage(k: int, end: int, surfels: Surfels, lists: TileLists, overflow: wp.bool, middle: Vec2, half: Vec2):
-    """(number of surfels staged, this lane's surfel): what `candidate` leaves of the lanes' places k."""
-    i = candidate(k, end, surfels, lists, overflow, middle, half)
     chosen = ballot(wp.where(i >= 0, 1, 0))
     sync_warp()  # the batch before has been read
     if i >= 0:

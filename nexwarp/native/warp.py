@@ -46,11 +46,6 @@ def ballot(x: wp.int32) -> wp.int32:
     """Return, as bits, the lanes in which x is nonzero."""
 
 
-@wp.func_native(snippet("return __ffs(mask) - 1;", "return 0;"))
-def lowest_lane(mask: wp.int32) -> wp.int32:
-    """Return the lowest lane of a ballot that is not empty."""
-
-
 @wp.func_native(snippet("return __shfl_sync(0xffffffffu, x, source);", "return x;"))
 def from_lane(x: wp.int32, source: wp.int32) -> wp.int32:
     """Return the value that x has in the lane `source`."""
