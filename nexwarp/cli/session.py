@@ -101,7 +101,7 @@ class Session(StageStore):
             trainer.restore(folder, partial(display.warn, self.console), extend=True)
             self.console.print(f"resumed at iteration {trainer.iteration:,}")
         elif self.resume and not self.begun:
-            self.console.print(f"{folder}: no checkpoint yet, training starts from the beginning")
+            self.console.print(f"{self.run}: no checkpoint yet, training starts from the beginning")
         self.begun = True
 
     def train(self, stage: Stage, trainer: Trainer) -> None:

@@ -29,7 +29,6 @@ from nexwarp.run.folder import (
     claimed_run,
     create_run,
     keep_camera_path,
-    prepare_run,
     read_run,
     update_run,
 )
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
 
 PLY = ".ply"
+SETTINGS = ("iterations", "max_surfels", "max_hits", "seed", "deterministic", "refine_poses")  # with their own options
 
 
 @dataclass
@@ -111,17 +111,18 @@ class Train:
         return self.gpus
 
     def _train(self, ranks: Ranks, console: Console) -> None:
-        if needs_cameras(self.scene):
-            self.scene = dataclasses.replace(self.scene, path=self._make_scene(ranks, console))
+        captured = Path(self.scene.path) if needs_cameras(self.scene) else None  # what the scene is to be made of
+        if captured is not None:
+            self.scene = dataclasses.replace(self.scene, path=str(scene_folder_of(captured)))
         run = self.run or Path("runs") / self.scene.name
         with ExitStack() as claim:
             record, resume = self._plan(run, ranks, claim)
             teachers = [load(path) for path in record.teachers]  # a wrong path is told before photos are read
-            start: Start = {}
-            # Of a run to resume, the checkpoint has the surfels, and only a texture counts.
-            if record.init is not None and not (resume and record.init.suffix == PLY):
-                is_ply = record.init.suffix == PLY
-                start = {"surfels": Surfels.load(record.init)} if is_ply else {"init": load(record.init)}
+            start = _start(record.init, resume)
+            if captured is not None:
+                if ranks.first:
+                    make_scene(captured, console)
+                ranks.barrier()
             scene = _load_scene(record, ranks, console)
             with naming("--init"):
                 check_start(scene, record.config, start)
@@ -134,9 +135,7 @@ class Train:
                 config = shortened(config, len(scene.train))
                 own = NO_TEACHERS if teachers else plan_teachers(config, len(scene.train))
                 record = dataclasses.replace(record, config=config, own=own)
-            session = Session(
-                run, record, console, ranks, resume=resume, tensorboard=self.tensorboard, every=self.checkpoint_every
-            )
+            session = Session(run, record, console, ranks, self.resume, self.tensorboard, self.checkpoint_every)
             runner = StageRunner(
                 scene, record.config, ranks.device, session, own=record.own, ranks=ranks, teachers=teachers, **start
             )
@@ -144,13 +143,10 @@ class Train:
                 before, after = read_run(run).config.iterations, record.config.iterations
                 if after > before:
                     text = "learning rates, density control and all other schedules are those of a run of that length"
-                    text = f"extended from {before:,} to {after:,} iterations: from here on, {text}"
-                    console.print(text)
+                    console.print(f"extended from {before:,} to {after:,} iterations: from here on, {text}")
                 update_run(run, record)
             elif ranks.first:
                 check_teachers_place(run, record.own.count)
-            if self.resume and not resume:
-                console.print(f"{run}: no checkpoint yet, training starts from the beginning")
             with self._viewer(runner, scene, record, run, console) if ranks.first else nullcontext() as viewer:
                 if not resume and ranks.first and (foreign := create_run(run, record)):
                     kept = f"{foreign[0]} and {len(foreign) - 1} more" if len(foreign) > 1 else foreign[0]
@@ -213,15 +209,8 @@ class Train:
 
     def _settings(self) -> tuple[dict[str, Json], dict[str, Json]]:
         """Return the settings that are given as options of their own, and those of --set, which must be others."""
-        flags: dict[str, Json] = {
-            "iterations": self.iterations,
-            "max_surfels": self.max_surfels,
-            "max_hits": self.max_hits,
-            "seed": self.seed,
-            "deterministic": self.deterministic or None,
-            "refine_poses": self.refine_poses or None,
-        }
-        flags = {name: value for name, value in flags.items() if value is not None}
+        options = {name: getattr(self, name) for name in SETTINGS}
+        flags: dict[str, Json] = {name: x for name, x in options.items() if x is not None and x is not False}
         with naming("--set"):
             settings = parse_settings(self.settings)
         for name in settings:
@@ -253,8 +242,7 @@ class Train:
             raise SettingError(f"--teacher: expected none, as the run to resume trains its own, got {self.teachers[0]}")
         if self.init is not None:
             _check_same("--init", old.init, self.init.resolve())
-        source = dataclasses.replace(old.source, path=self.scene.path)
-        return dataclasses.replace(old, source=source, config=config, teachers=self.teachers or old.teachers)
+        return dataclasses.replace(old, config=config, teachers=self.teachers or old.teachers)
 
     def _check(self) -> None:
         """Raise SettingError for invalid options, before the photos are read."""
@@ -267,18 +255,6 @@ class Train:
 
             check_server(self.host, self.port)
 
-    def _make_scene(self, ranks: Ranks, console: Console) -> str:
-        """Return the scene of a video or photos, which rank 0 makes unless the run folder would be refused later."""
-        scene = scene_folder_of(Path(self.scene.path))
-        if ranks.first:
-            self._check()
-            run = self.run or Path("runs") / scene.name
-            resume = prepare_run(run, SceneSource(str(scene)), resume=self.resume, overwrite=self.overwrite)
-            self._record(run, resume, ranks)
-            make_scene(Path(self.scene.path), console)
-        ranks.barrier()
-        return str(scene)
-
     def _viewer(
         self, runner: StageRunner, scene: Scene, record: RunRecord, run: Path, console: Console
     ) -> AbstractContextManager["Viewer | None"]:
@@ -287,17 +263,24 @@ class Train:
             return nullcontext()
         from nexwarp.viewer import Viewer, ViewerOptions
 
-        sets = {"train": scene.train, "test": scene.test}
+        camera, iterations = scene.train[0].camera, record.config.iterations
         viewer = Viewer(
             lambda: runner.trainer.model(),
-            {group: {view.name: view.camera for view in views} for group, views in sets.items()},
-            ViewerOptions(
-                scene.train[0].camera.near, record.source.name, self.host, self.port, record.config.iterations
-            ),
-            save_path=partial(keep_camera_path, run, origin=scene.train[0].camera.origin),
+            scene.cameras,
+            ViewerOptions(camera.near, record.source.name, self.host, self.port, iterations),
+            save_path=partial(keep_camera_path, run, origin=camera.origin),
         )
         console.print(f"viewer: {viewer.url}")
         return viewer
+
+
+def _start(init: Path | None, resume: bool) -> Start:
+    """Read what a training starts from, if it is not the scene alone."""
+    if init is None:
+        return {}
+    if init.suffix != PLY:
+        return {"init": load(init)}
+    return {} if resume else {"surfels": Surfels.load(init)}  # the checkpoint of a run to resume has the surfels
 
 
 def _flag(name: str) -> str:
