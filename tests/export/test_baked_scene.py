@@ -2,6 +2,7 @@ import dataclasses
 import math
 import re
 import struct
+from pathlib import Path
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from nexwarp.errors import FormatError, MissingError
 from nexwarp.export.bake import bake, dimmed, measure
 from nexwarp.export.baked_scene import BAKED_FILE, BakedScene
 from nexwarp.export.glb import CUTOFF, LEAST_ALPHA, bake_cards, make_cards, save_glb
-from nexwarp.export.web.export import one_file, page_files
+from nexwarp.export.web.export import one_file
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN, TINY
 from nexwarp.model.surfels import Activated
 from nexwarp.ops.atlas import Cut
@@ -41,10 +42,15 @@ def baked(model, cameras):
 
 
 @pytest.fixture(scope="module")
-def files(model, cameras) -> dict[str, bytes]:
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("page")
+
+
+@pytest.fixture(scope="module")
+def files(model, cameras, folder) -> dict[str, bytes]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nexwarp.export.fit.FEWEST_STEPS", 10)
-        return page_files(model, cameras)
+        return support.exported(model, cameras, folder)
 
 
 def in_double(scene: BakedScene) -> BakedScene:
@@ -134,14 +140,10 @@ def test_images_and_gradients_are_those_of_the_definition(form, device):
     assert form == "mask" or len(expected) == (5 if form == "surfels" else 2)
 
 
-def test_a_page_is_read_as_it_is_drawn(files, model, baked, cameras, tmp_path):
-    (tmp_path / "page").mkdir()
-    for name, data in files.items():
-        if "/" not in name:
-            (tmp_path / "page" / name).write_bytes(data)
+def test_a_page_is_read_as_it_is_drawn(files, folder, model, baked, cameras, tmp_path):
     (tmp_path / "one.html").write_bytes(one_file(files))
-    places = ("one.html", "page", "page/index.html", f"page/{BAKED_FILE}")
-    scenes = [nw.load_baked(tmp_path / place) for place in places]
+    places = (tmp_path / "one.html", folder, folder / "index.html", folder / BAKED_FILE)
+    scenes = [nw.load_baked(place) for place in places]
     for camera in cameras.values():
         images = [scene.render(camera) for scene in scenes]
         assert all(torch.equal(image, images[0]) for image in images)

@@ -107,27 +107,6 @@ def export_web(
     """
     single = out.suffix == ".html"
     picture = f"{out.stem if single else Path(INDEX).stem}.preview.jpg"
-    content = page_files(model, cameras, views, quality=quality, page=page, picture=picture, progress=progress)
-    if single:
-        preview = {name: content.pop(name) for name in (picture,) if name in content}
-        content = {out.name: one_file(content)} | preview
-        out = out.parent
-    files = {out / name: data for name, data in sorted(content.items(), key=lambda item: item[0] != INDEX)}
-    write_together(files)  # the page itself last
-    return list(files)
-
-
-def page_files(
-    model: Model,
-    cameras: Mapping[str, Camera],
-    views: Views = (),
-    *,
-    quality: str = "quantised",
-    page: Page = Page(),
-    picture: str = "index.preview.jpg",
-    progress: Progress = lambda *_: None,
-) -> dict[str, bytes]:
-    """Return the content of the page's files by name; `picture` is that of the link preview."""
     content, shown = dict(static_files()), model
     if page.background is not None:  # photos were taken before the model's own, so that one is baked
         options = replace(model.options, background=page.background)
@@ -136,15 +115,21 @@ def page_files(
         content |= {name: content[name].replace(BACKGROUND.encode(), color.encode()) for name in (INDEX, "style.css")}
     poster = _poster(shown, next(iter(cameras.values()))) if cameras else None
     content[INDEX] = _index(content[INDEX].decode(), page, "" if poster is None else picture).encode()
-    scale = {"metres": page.metres}
-    facts = {"title": page.title, **scale}
-    content[SCENE_FILE] = encode_scene(shown, cameras, quality=quality, facts=facts, poster=poster)
-    if poster is not None:
-        content[picture] = poster
+    facts: dict[str, object] = {"metres": page.metres}
+    content[SCENE_FILE] = encode_scene(
+        shown, cameras, quality=quality, facts={"title": page.title, **facts}, poster=poster
+    )
     if cameras and len(model.surfels):
         scene = bake(model, views or list(cameras.values()), progress=progress)
-        content |= encode_baked(scene, shown, cameras, scale)
-    return content
+        content |= encode_baked(scene, shown, cameras, facts)
+    if single:
+        content = {out.name: one_file(content)}
+        out = out.parent
+    if poster is not None:
+        content[picture] = poster
+    files = {out / name: data for name, data in sorted(content.items(), key=lambda item: item[0] != INDEX)}
+    write_together(files)  # the page itself last
+    return list(files)
 
 
 def _index(text: str, page: Page, picture: str) -> str:

@@ -7,7 +7,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp.export.bake import bake
-from nexwarp.export.web.export import Page, page_files
+from nexwarp.export.web.export import Page
 from tests.export.web import support
 from tests.export.web.support import CHROMIUM, FLAGS, WEBGPU, PageTab
 
@@ -24,10 +24,10 @@ def model(cameras) -> nw.Model:
 
 
 @pytest.fixture(scope="module")
-def site(model, cameras) -> dict[str, bytes]:
+def site(model, cameras, tmp_path_factory) -> dict[str, bytes]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nexwarp.export.web.export.bake", functools.partial(bake, steps=10))
-        return page_files(model, cameras, page=Page(title="Two & <three>"))
+        return support.exported(model, cameras, tmp_path_factory.mktemp("site"), page=Page(title="Two & <three>"))
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from PIL import Image
 import nexwarp as nw
 from nexwarp.export.baked_scene import BakedScene
 from nexwarp.export.web.baked import encode_harmonics, encode_picture
+from nexwarp.export.web.export import export_web
 from nexwarp.export.web.quantise import CHUNK
 from nexwarp.model.texture import NEVER
 from tests.narrowing import present
@@ -148,6 +149,12 @@ def ring_model(cameras: dict[str, nw.Camera], count: int, limits: nw.DetailLimit
         texture.grid.mul_(0.3)
     surfels = make_surfels(random_scene(count, width=64, height=48, seed=3))
     return nw.Model(surfels, texture, exposures, limits, nw.RenderOptions(background=(0.1, 0.2, 0.3)))
+
+
+def exported(model: nw.Model, cameras: dict[str, nw.Camera], folder: Path, **options: Any) -> dict[str, bytes]:
+    """The files of a model's page by name."""
+    files = export_web(model, cameras, folder, **options)
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
 
 def bilinear(texels: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
