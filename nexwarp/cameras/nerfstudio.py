@@ -132,14 +132,19 @@ def load_camera_path(
     cameras = []
     for i, entry in enumerate(list_of(path, data, "camera_path")):
         where = f"{path}: camera_path[{i}]"
-        pose = matrix_of(where, entry, "camera_to_world")
+        pose = matrix_of(where, entry, "camera_to_world") @ FLIP
+        pose[:3, 3] -= pose.new_tensor(origin)
         if all(key in entry for key in INTRINSICS):
             fx, fy, cx, cy = (number_of(where, entry, key) for key in INTRINSICS)
         else:
             fov = number_of(where, entry, "fov", above=0.0, below=180.0)
             fx = fy = height / (2 * math.tan(math.radians(fov) / 2))
             cx, cy = width / 2, height / 2
-        cameras.append(_camera(where, pose, (fx, fy, cx, cy), (width, height), near, origin))
+        K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        try:
+            cameras.append(Camera(torch.linalg.inv(pose).float(), K, width, height, near, origin=origin))
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from None
     return CameraPath(cameras, fps)
 
 
@@ -185,24 +190,6 @@ def intrinsics_of(
 def merged(frame: Mapping[str, Json], file: Mapping[str, Json]) -> JsonObject:
     """The values of a frame, and those of its file that it does not have; null counts as none."""
     return {key: value for values in (file, frame) for key, value in values.items() if value is not None}
-
-
-def _camera(
-    where: str,
-    pose: torch.Tensor,
-    intrinsics: tuple[float, ...],
-    size: tuple[int, int],
-    near: float,
-    origin: tuple[float, float, float],
-) -> Camera:
-    fx, fy, cx, cy = intrinsics
-    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    pose = pose @ FLIP
-    pose[:3, 3] -= pose.new_tensor(origin)
-    try:
-        return Camera(torch.linalg.inv(pose).float(), K, *size, near, origin=origin)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
 
 
 def list_of(path: Path, data: JsonObject, key: str) -> list[JsonObject]:
