@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from nexwarp.cameras.camera import Camera
+from nexwarp.cameras.paths import camera_poses
 from nexwarp.errors import check_range, check_tensors
 from nexwarp.machine import torch_threads
 
@@ -32,7 +33,9 @@ def rigid_motion(twist: torch.Tensor) -> torch.Tensor:
     twice, eye = skew @ skew, torch.eye(3, dtype=twist.dtype, device=twist.device)
     rotation = eye + first * skew + second * twice
     shift = (eye + second * skew + third * twice) @ v[..., None]
-    return nn.functional.pad(torch.cat([rotation, shift], dim=-1), (0, 0, 0, 1)) + _last_row(twist)
+    # Assigning a number would copy it from the CPU, which a CUDA graph cannot capture.
+    last_row = nn.functional.pad(twist.new_ones(1, 1), (3, 0, 3, 0))
+    return nn.functional.pad(torch.cat([rotation, shift], dim=-1), (0, 0, 0, 1)) + last_row
 
 
 def _series(square: torch.Tensor, lowest: int) -> torch.Tensor:
@@ -41,11 +44,6 @@ def _series(square: torch.Tensor, lowest: int) -> torch.Tensor:
     for k in reversed(range(TERMS)):
         total = total * -square + 1 / math.factorial(2 * k + lowest)
     return total
-
-
-def _last_row(like: torch.Tensor) -> torch.Tensor:
-    # Assigning a number would copy it from the CPU, which a CUDA graph cannot capture.
-    return nn.functional.pad(torch.ones(1, 1, dtype=like.dtype, device=like.device), (3, 0, 3, 0))
 
 
 def corrected(viewmat: torch.Tensor, twist: torch.Tensor, pivot: torch.Tensor) -> torch.Tensor:
@@ -79,9 +77,8 @@ class PoseCorrections(nn.Module):
         check_range("scale", scale, 1e-30, 1e30)
         self.scale = scale
         self.corrections = nn.Parameter(torch.zeros(len(cameras), 6))
-        viewmats = torch.stack([camera.viewmat.detach().double().cpu() for camera in cameras])
         pivots = torch.tensor([scale] * len(cameras) if depths is None else list(depths), dtype=torch.float64)
-        self.register_buffer("gauge", _gauge_directions(viewmats, pivots, scale).float().contiguous(), persistent=False)
+        self.register_buffer("gauge", _gauge_directions(cameras, pivots, scale).float().contiguous(), persistent=False)
         self.register_buffer("pivots", pivots.float().contiguous(), persistent=False)
 
     def viewmat(self, given: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:
@@ -121,10 +118,10 @@ def _row(values: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:
     return values[view] if isinstance(view, int) else values.index_select(0, view)[0]
 
 
-def _gauge_directions(viewmats: torch.Tensor, pivots: torch.Tensor, scale: float) -> torch.Tensor:
+def _gauge_directions(cameras: Sequence[Camera], pivots: torch.Tensor, scale: float) -> torch.Tensor:
     """Orthonormal basis (6 V, G) of the corrections that a similarity of the world makes, to first order."""
-    rotations, shifts = viewmats[:, :3, :3], viewmats[:, :3, 3]
-    centers = -(rotations.mT @ shifts[..., None])[..., 0]
+    viewmats, centers = camera_poses(cameras)
+    rotations = viewmats[:, :3, :3]
     offsets = centers - centers.mean(0)  # about the cameras' middle: turns and shifts are then of like size
     forward = torch.tensor([[0.0, 0.0, 1.0]], dtype=viewmats.dtype)
     columns = []
