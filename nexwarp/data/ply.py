@@ -3,8 +3,8 @@
 import codecs
 import io
 import itertools
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
@@ -27,8 +27,15 @@ BAND_0 = 0.28209479177387814
 GREY = 128
 OVERSHOOT = 2.0  # largest value of floating colours in [0, 1]; those with larger ones are in [0, 255]
 
-# Name, count, and properties as (name, numpy type); None for an element with lists.
-Element: TypeAlias = tuple[str, int, list[tuple[str, str]] | None]
+
+@dataclass
+class Element:
+    """An element of a header, such as the vertices."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str]]  # names and numpy types of those that are no lists
+    has_lists: bool = False
 
 
 def read_ply(path: Path) -> Cloud:
@@ -69,53 +76,42 @@ def _header(path: Path, file: io.BufferedReader) -> tuple[str, list[Element]]:
         words = line.decode("ascii", "replace").split()
         if not line:
             raise ValueError(f"{path}: truncated, the PLY header has no end_header")
-        if words[:1] == ["end_header"]:
-            if form is None:
-                raise ValueError(f"{path}: expected a PLY header with a format, found none")
-            return form, elements
-        if words[:1] == ["format"] and len(words) == 3 and words[1] in ORDERS:
-            form = words[1]
-        elif not _read_element(words, elements) and words and words[0] not in ("comment", "obj_info"):
-            raise ValueError(f"{path}: expected a PLY header, got the line {' '.join(words)[:60]!r}")
+        match words:
+            case ["end_header", *_]:
+                if form is None:
+                    raise ValueError(f"{path}: expected a PLY header with a format, found none")
+                return form, elements
+            case ["format", order, _] if order in ORDERS:
+                form = order
+            case ["element", name, count] if count.isdecimal() and len(count) <= 18:
+                elements.append(Element(name, int(count), []))
+            case ["property", "list", _, _, _] if elements:
+                elements[-1].has_lists = True
+            case ["property", kind, name] if elements and kind in TYPES:
+                elements[-1].properties.append((name, TYPES[kind]))
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case _:
+                raise ValueError(f"{path}: expected a PLY header, got the line {' '.join(words)[:60]!r}")
     raise ValueError(f"{path}: expected a PLY header of at most {MAX_HEADER:,} bytes")
-
-
-def _read_element(words: list[str], elements: list[Element]) -> bool:
-    """Add an element, or a property of the last one, to `elements`; return False for another line."""
-    if words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) <= 18:
-        elements.append((words[1], int(words[2]), []))
-        return True
-    if words[:1] != ["property"] or not elements:
-        return False
-    name, count, properties = elements[-1]
-    if words[1:2] == ["list"] and len(words) == 5:
-        elements[-1] = (name, count, None)
-        return True
-    if len(words) != 3 or words[1] not in TYPES:
-        return False
-    if properties is not None:
-        properties.append((words[2], TYPES[words[1]]))
-    return True
 
 
 def _vertices(path: Path, file: io.BufferedReader, form: str, elements: list[Element]) -> np.ndarray:
     """Read the vertices as a structured array; skip the elements before them."""
     size = path.stat().st_size
-    for name, count, properties in elements:
-        left = size - file.tell()
-        if properties is None:
-            what = "its lists" if name == "vertex" else f"lists of {one_line(name, 60)} before them"
+    for element in elements:
+        left, name, count = size - file.tell(), one_line(element.name, 60), element.count
+        if element.has_lists:
+            what = "its lists" if name == "vertex" else f"lists of {name} before them"
             raise ValueError(f"{path}: expected vertices without lists first, got {what}")
-        fields = [(field, ORDERS[form] + kind) for field, kind in properties]
-        if len({field for field, _ in fields}) < len(fields) or len(fields) > MAX_PROPERTIES:
-            raise ValueError(f"{path}: element {one_line(name, 60)}: expected properties of different names")
+        fields = [(field, ORDERS[form] + kind) for field, kind in element.properties]
+        if len(dict(fields)) < len(fields) or len(fields) > MAX_PROPERTIES:
+            raise ValueError(f"{path}: element {name}: expected properties of different names")
         dtype = np.dtype(fields)
         # An ascii value has at least a digit and a separator.
         least = count * (dtype.itemsize if form != "ascii" else max(2 * len(fields), 1)) - (form == "ascii")
         if least > left or count > MAX_POINTS:
-            raise ValueError(
-                f"{path}: truncated, expected {count:,} of element {one_line(name, 60)}, got {left:,} bytes for them"
-            )
+            raise ValueError(f"{path}: truncated, expected {count:,} of element {name}, got {left:,} bytes for them")
         if name == "vertex":
             return _ascii(path, file, dtype, count) if form == "ascii" else np.fromfile(file, dtype, count)
         if form == "ascii":
