@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated, cast
+from typing import Annotated, TypeAlias, cast
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from nexwarp.data.scene import DEMO, SceneSource, demo_folder, parse_color
 from nexwarp.data.transforms import lens_keys
 from nexwarp.errors import OutOfMemoryError, RunError, SettingError, check_package, require
 from nexwarp.export.bake import Progress
-from nexwarp.export.baked_scene import GLB, BakedScene, load_baked
+from nexwarp.export.baked_scene import GLB, load_baked
 from nexwarp.export.fit import Views
 from nexwarp.export.glb import ALPHAS, bake_cards, save_glb
 from nexwarp.export.mesh import Mesh, extract_mesh, save_mesh
@@ -63,6 +63,7 @@ OPTIONS = {
     "usd": ("collision",),
     "web": ("title", "caption", "background", "annotations", "url"),
 }
+Device: TypeAlias = torch.device | str
 Figures = dict[str, dict[str, float]]  # metrics on test views, of what was baked and of the model
 GREY_LEVEL = 1 / 255
 DIFFUSE_SHARE = 1 / 4  # of a run's iterations, for which its model is trained with one colour from all directions
@@ -134,7 +135,7 @@ class ExportOrder:
 def export_run(
     opened: OpenedModel,
     order: ExportOrder,
-    device: torch.device | str = "cpu",
+    device: Device = "cpu",
     observe: Progress = lambda *_: None,
     report: Callable[[str], object] = lambda _: None,
 ) -> Sequence[Path]:
@@ -187,41 +188,64 @@ def _is_cropped(opened: OpenedModel) -> bool:
 
 
 def _export(
-    opened: OpenedModel,
-    order: ExportOrder,
-    folder: Path,
-    scene: Scene | None,
-    device: torch.device | str,
-    observe: Progress,
+    opened: OpenedModel, order: ExportOrder, folder: Path, scene: Scene | None, device: Device, observe: Progress
 ) -> Sequence[Path]:
-    """Write the files of a format."""
+    """Write the files of a format, and return them."""
     files = [folder / name for name in EXPORTS[order.format]]
-    if order.format == "compact":  # which needs no cameras
+    if order.format in BAKED:
+        return _export_baked(opened, order, files[0], scene, device, observe)
+    if order.format == "compact":
         save_model(files[0], opened.model, compact=_noise(opened) if order.noise is None else order.noise)
-        return files
-    views = {name: camera for members in opened.cameras.values() for name, camera in members.items()}
-    # What is baked learns from no test view, not even from its pose.
-    seen: Views = scene.train if scene is not None else [*opened.cameras.get(TRAIN, {}).values()]
-    if order.format == "web":
-        model, out, page = opened.model.to(device), order.out or files[0], _page(opened, order)
-        return export_web(model, views, out, seen, quality=order.quality, page=page, progress=observe)
-    if order.format == "cameras":
+    elif order.format == "cameras":
         _export_cameras(opened, *files)
     elif order.format == "mesh":
-        model, scale = opened.model.to(device), opened.frame.scale
-        voxel, far = (None if x is None else x / scale for x in (order.voxel, order.far))
-        mesh = extract_mesh(model, opened.trained_cameras, voxel=voxel, far=far, observe=observe)
-        save_mesh(files[0], mesh.moved(opened.frame))
+        voxel, far = (None if x is None else x / opened.frame.scale for x in (order.voxel, order.far))
+        save_mesh(files[0], _mesh(opened, device, observe, voxel, far))
     else:
-        cards = None
-        if order.format in CARDS:
-            if not views:
-                raise RunError(f"{opened.path}: --format {order.format}: expected the run's {CAMERAS_FILE}, found none")
-            aim = opened.model.to(device)
-            model = aim if scene is None else _diffuse(opened, scene, device, observe)
-            cards = bake_cards(model, seen or [*views.values()], order.alpha, aim=aim, progress=observe)
-        _export_geometry(opened, order, files, list(views.values()), cards, device, observe)
+        _export_splats(opened, order, files)
     return files
+
+
+def _export_baked(
+    opened: OpenedModel, order: ExportOrder, file: Path, scene: Scene | None, device: Device, observe: Progress
+) -> Sequence[Path]:
+    """Write surfels with a baked texture, as a page or as cards, and return the files."""
+    views, motion = opened.views, opened.frame
+    if order.format in CARDS and not views:
+        raise RunError(f"{opened.path}: --format {order.format}: expected the run's {CAMERAS_FILE}, found none")
+    # What is baked learns from no test view, not even from its pose.
+    seen: Views = scene.train if scene is not None else [*opened.cameras.get(TRAIN, {}).values()]
+    aim = opened.model.to(device)
+    if order.format == "web":
+        page, out = _page(opened, order), order.out or file
+        return export_web(aim, views, out, seen, quality=order.quality, page=page, progress=observe)
+    model = aim if scene is None else _diffuse(opened, scene, device, observe)
+    cards = bake_cards(model, seen or [*views.values()], order.alpha, aim=aim, progress=observe)
+    means, quats = moved_poses(cards.shape.means, cards.shape.quats, motion)
+    shape = cards.shape._replace(means=means, quats=quats, scales=cards.shape.scales * motion.scale)
+    cards, cameras = replace(cards, shape=shape), [motion.camera(camera) for camera in views.values()]
+    if order.format == "glb":
+        save_glb(file, cards, cameras)
+    else:
+        collision = _collision(opened, device, observe) if order.collision else None
+        surfels, degree = moved_surfels(opened.model.surfels, motion), opened.model.options.sh_degree
+        save_usdz(file, cards, surfels, min(degree, SPLAT_DEGREE), cameras, collision)
+    return [file]
+
+
+def _export_splats(opened: OpenedModel, order: ExportOrder, files: Sequence[Path]) -> None:
+    """Write surfels as Gaussians; PLY also with all their properties."""
+    surfels = moved_surfels(opened.model.surfels, opened.frame)
+    cameras = [opened.frame.camera(camera) for camera in opened.views.values()]
+    degree = min(opened.model.options.sh_degree, SPLAT_DEGREE)
+    splats = gaussians(surfels, degree, cameras, order.max_extent)
+    if order.format == "gltf-splats":
+        save_splats_glb(files[0], splats, cameras)
+    elif order.format == "spz":
+        save_splats_spz(files[0], splats)
+    else:
+        save_surfels_ply(files[0], surfels)
+        save_splats_ply(files[1], splats)
 
 
 def _page(opened: OpenedModel, order: ExportOrder) -> Page:
@@ -236,50 +260,21 @@ def _page(opened: OpenedModel, order: ExportOrder) -> Page:
     return Page(order.title or opened.title or "nexwarp", order.caption, color, moved, order.url, metres)
 
 
-def _export_geometry(
-    opened: OpenedModel,
-    order: ExportOrder,
-    files: Sequence[Path],
-    cameras: list[Camera],
-    cards: BakedScene | None,
-    device: torch.device | str,
-    observe: Progress,
-) -> None:
-    """Write surfels as textured cards or as Gaussians."""
-    motion, degree = opened.frame, min(opened.model.options.sh_degree, SPLAT_DEGREE)
-    surfels = moved_surfels(opened.model.surfels, motion)
-    moved = [motion.camera(camera) for camera in cameras]
-    if cards is not None:
-        means, quats = moved_poses(cards.shape.means, cards.shape.quats, motion)
-        shape = cards.shape._replace(means=means, quats=quats, scales=cards.shape.scales * motion.scale)
-        cards = replace(cards, shape=shape)
-        if order.format == "glb":
-            save_glb(files[0], cards, moved)
-        else:
-            collision = _collision(opened, device, observe) if order.collision else None
-            save_usdz(files[0], cards, surfels, degree, moved, collision)
-        return
-    if order.format == "ply":
-        save_surfels_ply(files[0], surfels)
-    splats = gaussians(surfels, degree, moved, order.max_extent)
-    if order.format == "gltf-splats":
-        save_splats_glb(files[-1], splats, moved)
-    elif order.format == "spz":
-        save_splats_spz(files[-1], splats)
-    else:
-        save_splats_ply(files[-1], splats)
-
-
-def _collision(opened: OpenedModel, device: torch.device | str, observe: Progress) -> Mesh:
-    """Return a coarse mesh of a run's surface, in the exported coordinates."""
+def _mesh(
+    opened: OpenedModel, device: Device, observe: Progress, voxel: float | None, far: float | None = None
+) -> Mesh:
+    """Return a mesh of a run's surface in the exported coordinates; lengths are in those of the training."""
     model = opened.model.to(device)
-    low, high = np.quantile(model.surfels.means.detach().cpu().numpy(), MIDDLE, axis=0)
-    voxel = float((high - low).max()) / COLLISION_VOXELS
-    mesh = extract_mesh(model, opened.trained_cameras, voxel=voxel, observe=observe)
-    return mesh.moved(opened.frame)
+    return extract_mesh(model, opened.trained_cameras, voxel=voxel, far=far, observe=observe).moved(opened.frame)
 
 
-def _diffuse(opened: OpenedModel, scene: Scene, device: torch.device | str, observe: Progress) -> Model:
+def _collision(opened: OpenedModel, device: Device, observe: Progress) -> Mesh:
+    """Return a coarse mesh of a run's surface, in the exported coordinates."""
+    low, high = np.quantile(opened.model.surfels.means.detach().cpu().numpy(), MIDDLE, axis=0)
+    return _mesh(opened, device, observe, float((high - low).max()) / COLLISION_VOXELS)
+
+
+def _diffuse(opened: OpenedModel, scene: Scene, device: Device, observe: Progress) -> Model:
     """Continue a run's training with one colour from all directions, as cards have it; no surfel is added.
 
     Returns the model unchanged where it is cropped, as the photos then have no loss around its edge, and where its
@@ -308,7 +303,7 @@ def _diffuse(opened: OpenedModel, scene: Scene, device: torch.device | str, obse
     return model
 
 
-def _photos(opened: OpenedModel, device: torch.device | str, observe: Progress) -> Scene | None:
+def _photos(opened: OpenedModel, device: Device, observe: Progress) -> Scene | None:
     """Read the scene of a run, its training views with the run's poses; None where that is impossible.
 
     Masks leave out what a crop has changed.
@@ -341,7 +336,7 @@ def _masked(view: View, whole: Model, part: Model) -> View:
 
 
 @torch.no_grad()
-def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], device: torch.device | str) -> Figures:
+def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], device: Device) -> Figures:
     """Return metrics of a baked file and of the model on test views; LPIPS where its weights are at hand."""
     model = opened.model.to(device)
     file = next(file for file in files if file.suffix in (".html", GLB))
@@ -404,22 +399,18 @@ def _export_cameras(opened: OpenedModel, transforms: Path, camera_path: Path) ->
 
 def _originals(opened: OpenedModel) -> tuple[dict[str, str], dict[str, JsonObject]]:
     """Return the files of a run's views in the scene's folder, and the keys of lenses that nerfstudio knows by file."""
-    views = [name for members in opened.cameras.values() for name in members]
-    images = SceneSource.images if opened.source is None else opened.source.images
-    if opened.source is None or not views:
-        return {name: f"{images}/{name}" for name in views}, {}
-    folder = demo_folder() if opened.source.path == DEMO else Path(opened.source.path)
+    source, photos = opened.source or SceneSource(""), None
     try:
-        photos = {photo.name: photo for photo in opened.source.photos()}
+        if opened.source is not None and opened.views:
+            photos = {photo.name: photo for photo in source.photos()}
     except (OSError, ValueError) as error:
-        warnings.warn(
-            f"{opened.source.path}: the scene cannot be read ({one_line(error)}), so the intrinsics are those of the "
-            "photos as they were trained on, undistorted and reduced",
-            stacklevel=2,
-        )
-        return {name: f"{images}/{name}" for name in views}, {}
+        taken = "the intrinsics are those of the photos as they were trained on, undistorted and reduced"
+        warnings.warn(f"{source.path}: the scene cannot be read ({one_line(error)}), so {taken}", stacklevel=2)
+    if photos is None:
+        return {name: f"{source.images}/{name}" for name in opened.views}, {}
+    folder = demo_folder() if source.path == DEMO else Path(source.path)
     names, lenses = {}, {}
-    for name in views:
+    for name in opened.views:
         photo = photos.get(name)
         keys = None if photo is None else lens_keys(photo.lens, *image_size(photo.file))
         names[name] = f"{UNDISTORTED}/{name}"

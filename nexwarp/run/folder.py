@@ -448,6 +448,11 @@ class OpenedModel:
         return load_cameras(file) if file.is_file() else {}
 
     @property
+    def views(self) -> dict[str, Camera]:
+        """The cameras of all sets by name."""
+        return {name: camera for members in self.cameras.values() for name, camera in members.items()}
+
+    @property
     def trained_cameras(self) -> list[Camera]:
         """The training cameras; RunError where there are none."""
         if not (cameras := self.cameras.get(TRAIN)):
@@ -456,7 +461,7 @@ class OpenedModel:
 
     def path_cameras(self) -> dict[str, dict[str, Camera]]:
         """Return the cameras that a path is made of; without any, a ring around the surfels."""
-        if any(self.cameras.values()):
+        if self.views:
             return self.cameras
         ring = surrounding(self.model.surfels.means, near_depth(self.model))
         return {"train": {f"around_{index:02d}": camera for index, camera in enumerate(ring)}}

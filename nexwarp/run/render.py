@@ -151,7 +151,7 @@ class RenderOrder:
             file = Path(name)
             if self.frames is not None:
                 raise SettingError(f"--frames: expected no value with {file}, which sets it, got {self.frames}")
-            near = next((c.near for group in opened.cameras.values() for c in group.values()), near_depth(opened.model))
+            near = next((camera.near for camera in opened.views.values()), near_depth(opened.model))
             frame = opened.frame
             origin = (opened.model.origin if frame.is_identity else None) or WORLD
             path = load_camera_path(file, near * frame.scale, origin)
