@@ -41,37 +41,22 @@ BUILT_IN = (
 ALPHA_HITS = 2  # of a pixel's hits, the heaviest ones whose weights the alpha term counts
 
 
-def photo_losses(
-    image: torch.Tensor,
-    textured: torch.Tensor,
-    weights: torch.Tensor,
-    target: torch.Tensor,
-    factors: LossWeights,
-    *,
-    mask: torch.Tensor | None = None,
-    empty: torch.Tensor | None = None,
-    saturation: float | None = None,
-) -> dict[str, torch.Tensor]:
-    """Return the terms "l1", "dssim", "texture" and "alpha" of a rendering and its photo, times their factors.
+def photo_losses(out: Rendering, target: Target, factors: LossWeights) -> dict[str, torch.Tensor]:
+    """Return the terms "l1", "dssim", "texture" and "alpha" of a rendering, `as_taken`, times their factors.
 
-    A term whose factor is 0 is neither computed nor returned; with K = 0 there is no texture and no alpha term.
-
-    Args:
-        image: (H, W, 3), the rendering with its background; clamped to [0, 1], as by the authors' code.
-        textured: (H, W, 3), sum_k W T.
-        weights: (H, W, K), W.
-        target: (H, W, 3), the photograph.
-        factors: of the terms.
-        mask: (H, W) bool, True where the photograph counts: elsewhere no term has a gradient, and those of the image
-            and the texture are 0. None is True everywhere.
-        empty: (H, W) bool, True where `target` is nothing but background: texture and alpha terms do not count there.
-        saturation: a channel of `target` with at least this value equals any brighter one in the L1 and texture terms.
+    A term whose factor is 0 is neither computed nor returned; with K = 0 there is no texture and no alpha term. The
+    image is clamped to [0, 1], as by the authors' code. Where the photo does not count, no term has a gradient, and
+    those of the image and the texture are 0. Where there is nothing but background, texture and alpha terms do not
+    count. In the L1 and texture terms, a channel of a photo with an exposure equals any brighter one from `SATURATION`
+    on.
     """
-    if mask is not None:
-        image = torch.where(mask[..., None], image, target)
-        textured, weights = _masked(textured, weights, target, mask)
-    if empty is not None:
-        textured, weights = _masked(textured, weights, target, ~empty)
+    image, textured, weights, photo = out.image, out.textured, out.weights, target.photo
+    if target.counts is not None:
+        image = torch.where(target.counts[..., None], image, photo)
+        textured, weights = _masked(textured, weights, photo, target.counts)
+    if target.empty is not None:
+        textured, weights = _masked(textured, weights, photo, ~target.empty)
+    saturation = None if target.exposure is None else SATURATION
     has_slots = weights.shape[-1] > 0
     # With all hits of K = 4, test views were worse than with K = 2.
     all_count = weights.shape[-1] <= ALPHA_HITS
@@ -81,7 +66,7 @@ def photo_losses(
         "alpha": factors.alpha * (has_slots and all_count),
     }
     l1_term, texture_term, alpha_term = photometric_terms(
-        image, textured, weights, target, **shares, saturation=saturation
+        image, textured, weights, photo, **shares, saturation=saturation
     )
     if not all_count and factors.alpha > 0.0:
         heaviest = weights[..., :ALPHA_HITS].contiguous()
@@ -90,7 +75,7 @@ def photo_losses(
         alpha_term = factors.alpha * alpha_term
     terms = {
         "l1": l1_term,
-        "dssim": weighted_dssim(image, target, factors.dssim) if factors.dssim > 0.0 else None,
+        "dssim": weighted_dssim(image, photo, factors.dssim) if factors.dssim > 0.0 else None,
         "texture": texture_term,
         "alpha": alpha_term,
     }
@@ -98,12 +83,12 @@ def photo_losses(
 
 
 def _masked(
-    textured: torch.Tensor, weights: torch.Tensor, target: torch.Tensor, mask: torch.Tensor
+    textured: torch.Tensor, weights: torch.Tensor, photo: torch.Tensor, mask: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Put the photograph, without a gradient, into the texture where the mask is False."""
+    """Put the photo, without a gradient, into the texture where the mask is False."""
     seen = mask[..., None]
     fixed = weights.detach()
-    perfect = target * (fixed.sum(-1, keepdim=True) + WEIGHT_EPSILON)
+    perfect = photo * (fixed.sum(-1, keepdim=True) + WEIGHT_EPSILON)
     return torch.where(seen, textured, perfect), torch.where(seen, weights, fixed)
 
 
@@ -172,16 +157,7 @@ def step_losses(
     Losses of one's own are added as they are.
     """
     texture, factors = state.texture, state.config.losses
-    losses = photo_losses(
-        out.image,
-        out.textured,
-        out.weights,
-        target.photo,
-        factors,
-        mask=target.counts,
-        empty=target.empty,
-        saturation=None if target.exposure is None else SATURATION,
-    )
+    losses = photo_losses(out, target, factors)
     if factors.opacity > 0:
         losses["opacity"] = factors.opacity * state.surfels.opacities.mean()
     if target.empty is not None and factors.empty > 0:

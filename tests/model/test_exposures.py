@@ -13,7 +13,7 @@ from nexwarp.model.render import draw
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train import exposure as exposure_calibration
 from nexwarp.train.exposure import Observations, calibrate_exposures, choose_fit, fit_exposures, observations
-from nexwarp.train.losses import SATURATION, as_taken, photo_losses
+from nexwarp.train.losses import as_taken, photo_losses
 from nexwarp.train.recipe import Config, LossWeights, TextureConfig
 from nexwarp.train.target import Target, mean_color
 from tests.narrowing import present
@@ -244,8 +244,7 @@ def test_brighter_than_a_saturated_pixel_is_no_error():
         photo = torch.full_like(image, 0.8 * gain).clamp(max=1.0)
         target = Target(camera, photo, 0.0, torch.tensor([gain] * 3))
         taken = as_taken(dataclasses.replace(out, image=image, textured=textured), target)
-        factors = LossWeights(alpha=0.0)
-        losses = photo_losses(taken.image, taken.textured, taken.weights, photo, factors, saturation=SATURATION)
+        losses = photo_losses(taken, target, LossWeights(alpha=0.0))
         assert losses["l1"] < 1e-6 and losses["dssim"] < 1e-4
         if gain > 1:
             (gradient,) = torch.autograd.grad(losses["l1"] + losses["dssim"], image)

@@ -1,9 +1,11 @@
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 import torch
 from torch.autograd import gradcheck
 
+import nexwarp as nw
 from nexwarp.cameras.camera import visible_points
 from nexwarp.ops.photometric import depth_term
 from nexwarp.train import losses
@@ -27,12 +29,17 @@ def arguments(slots: int = 2) -> dict[str, Any]:
     return {"image": image, "textured": textured, "weights": weights, "target": target}
 
 
+def terms_of(x: dict[str, Any], factors: LossWeights | None = None, **masks: Any) -> dict[str, torch.Tensor]:
+    camera, out = cast(nw.Camera, None), cast(nw.Rendering, SimpleNamespace(**x))
+    return losses.photo_losses(out, nw.Target(camera, x["target"], 0.0, **masks), factors or LossWeights())
+
+
 @pytest.mark.parametrize(("slots", "counted"), [(1, 1), (2, 2), (3, 2), (4, 2)])
 def test_photo_losses_are_the_papers_total(slots: int, counted: int) -> None:
     """The heaviest hits count as textured for the term of the weights alone: the texture's has all of them."""
     x = arguments(slots)
     x["weights"].requires_grad_()
-    terms = losses.photo_losses(**x, factors=LossWeights())
+    terms = terms_of(x)
     assert set(terms) == {"l1", "dssim", "texture", "alpha"}
     image, target = x["image"].clamp(0, 1), x["target"]
     total = 0.8 * reference.l1(image, target) + 0.2 * reference.dssim(image, target)
@@ -47,7 +54,7 @@ def test_photo_losses_are_the_papers_total(slots: int, counted: int) -> None:
 
 def test_terms_without_weight_or_input_are_not_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     def names(slots: int = 2, **weights: Any) -> set[str]:
-        return set(losses.photo_losses(**arguments(slots), factors=LossWeights(**weights)))
+        return set(terms_of(arguments(slots), LossWeights(**weights)))
 
     assert names(slots=0) == {"l1", "dssim"} and names(dssim=1.0) == {"dssim", "texture", "alpha"}
     monkeypatch.setattr(losses, "weighted_dssim", None)
@@ -65,20 +72,16 @@ def scene_of_losses() -> dict[str, torch.Tensor]:
     return {name: x.clone().requires_grad_() for name, x in leaves.items()} | {"target": target}
 
 
-def terms_of(tensors: dict[str, torch.Tensor], **options: Any) -> dict[str, torch.Tensor]:
-    return losses.photo_losses(**tensors, factors=LossWeights(), **options)  # type: ignore[arg-type]
-
-
 def test_a_mask_leaves_no_gradient_where_it_is_false() -> None:
     tensors = scene_of_losses()
     mask = torch.rand(13, 17) < 0.7
-    terms = terms_of(tensors, mask=mask)
+    terms = terms_of(tensors, counts=mask)
     total(terms.values()).backward()
     for name in ("image", "textured", "weights"):
         gradient = present(tensors[name].grad)
         assert not gradient[~mask].any() and gradient[mask].any(), name
     spoilt = {name: torch.where(mask[..., None], x, 0.1 * x) for name, x in tensors.items() if name != "weights"}
-    again = terms_of({**tensors, **spoilt, "target": tensors["target"]}, mask=mask)
+    again = terms_of({**tensors, **spoilt, "target": tensors["target"]}, counts=mask)
     for name in ("l1", "dssim", "texture"):
         assert_close(again[name], terms[name], kind="value", name=name)
 
