@@ -73,15 +73,20 @@ def on_change(control: "viser.GuiInputHandle[T]", act: Callable[[T], None]) -> N
     control.on_update(updated)
 
 
-def on_click(button: "viser.GuiButtonHandle", act: Callable[[], Awaitable[None] | None]) -> None:
-    """Call `act`, or await it, at each click."""
+def add_button(
+    gui: "viser.GuiApi", label: str, icon: str, act: Callable[[], Awaitable[None] | None], **options: Any
+) -> "viser.GuiButtonHandle":
+    """Add a button with an icon, by its name at Tabler; `act` is called, or awaited, at each click."""
+    from viser import IconName
 
     async def clicked(_: object) -> None:
         done = act()
         if done is not None:
             await done
 
+    button = gui.add_button(label, icon=IconName(icon), **options)
     button.on_click(clicked)
+    return button
 
 
 def set_changed(handle: object, name: str, value: object) -> None:
@@ -99,19 +104,16 @@ class PathEditor:
     """A path through views of one client, and its controls."""
 
     def __init__(self, session: "Session", save: Callable[[Sequence[Camera]], str]) -> None:
-        from viser import Icon
-
         self.session, self.save = session, save
         self.views: tuple[Camera, ...] = ()  # replaced, never changed: two threads read it
         self.playing = False
         gui = session.client.gui
         self.note = gui.add_markdown("**Camera path** through views that you add, for `nexwarp render --path`")
-        on_click(gui.add_button("Add this view", icon=Icon.PLUS), self.add)
-        remove = gui.add_button("Remove the last", icon=Icon.BACKSPACE, color="gray")
-        on_click(remove, lambda: self._set_views(self.views[:-1]))
+        add_button(gui, "Add this view", "plus", self.add)
+        add_button(gui, "Remove the last", "backspace", lambda: self._set_views(self.views[:-1]), color="gray")
         self.seconds = gui.add_number("Seconds", 6.0, min=SECONDS[0], max=SECONDS[1], step=0.1)
-        on_click(gui.add_button("Play, stop", icon=Icon.PLAYER_PLAY, color="gray"), self.play)
-        gui.add_button("Save path", icon=Icon.DEVICE_FLOPPY).on_click(lambda _: self.keep())  # on a thread: it writes
+        add_button(gui, "Play, stop", "player-play", self.play, color="gray")
+        add_button(gui, "Save path", "device-floppy", lambda: asyncio.to_thread(self.keep))  # it writes
 
     def add(self) -> None:
         """Append the current view, with the size of the home view; video codecs need even sizes."""
@@ -164,9 +166,9 @@ class CropEditor:
         self.ball = session.client.scene.add_icosphere(
             "/crop", 1.0, COLOURS["test"], wireframe=True, cast_shadow=False, receive_shadow=False, visible=False
         )
-        on_change(self.shown, lambda _: self.update())
-        on_change(self.radius, lambda _: self.update())
-        on_change(self.centre, lambda _: self.update())
+        controls: tuple[viser.GuiInputHandle[Any], ...] = (self.shown, self.radius, self.centre)
+        for control in controls:
+            on_change(control, lambda _: self.update())
         self.update()
 
     def update(self) -> None:
@@ -244,16 +246,13 @@ class TrainingPanel:
 
     def __init__(self, gui: "viser.GuiApi", total: int, wake: Callable[[], None]) -> None:
         """Add the controls of a training of `total` iterations; `wake` is called when it is paused or resumed."""
-        from viser import Icon
-
         self.total, self.wake = total, wake
         self.paused = False  # held between two steps
         self._last: tuple[float, int] | None = None  # time and step of the last status line
         with gui.add_folder("Training", order=0.0):
             self.progress = gui.add_progress_bar(0.0)
             self.status = gui.add_markdown("starting")
-            self.pause = gui.add_button("Pause", icon=Icon.PLAYER_PAUSE)
-        on_click(self.pause, self.toggle_pause)
+            self.pause = add_button(gui, "Pause", "player-pause", self.toggle_pause)
 
     def toggle_pause(self) -> None:
         """Pause the training, or resume it."""
@@ -440,16 +439,14 @@ class Session:
         on_change(control, change)
 
     def _cameras(self) -> None:
-        from viser import Icon
-
         gui = self.client.gui
-        on_click(gui.add_button("Back to the start", icon=Icon.HOME), lambda: self.go(self.home))
+        add_button(gui, "Back to the start", "home", lambda: self.go(self.home))
         if not self.cameras:
             gui.add_markdown("This run has no cameras.")
             return
         jump = gui.add_dropdown("Go to", tuple(self.cameras), hint="Go to the camera of a photo")
         on_change(jump, self.jump)
-        on_click(gui.add_button("Go there", icon=Icon.CAMERA), lambda: self.jump(jump.value))
+        add_button(gui, "Go there", "camera", lambda: self.jump(jump.value))
         visible = gui.add_checkbox("Show cameras", True, hint="Blue: training views. Orange: test views.")
         on_change(visible, lambda shown: set_changed(self.group, "visible", bool(shown)))
         if self.viewer.figures:
@@ -458,8 +455,6 @@ class Session:
 
     def _photos(self, figures: Mapping[str, tuple[float, float]]) -> None:
         """Add the list of the worst photos: a choice goes to the camera, and shows how to leave the photo out."""
-        from viser import Icon
-
         gui = self.client.gui
         names = {f"{figures[name][0]:.2f} dB {name}": name for name in list(figures)[:MOST_LISTED]}
         typical = [statistics.median(column) for column in zip(*figures.values(), strict=True)]
@@ -480,16 +475,14 @@ class Session:
 
         show(chosen.value)
         on_change(chosen, go)
-        on_click(gui.add_button("Go to the photo", icon=Icon.CAMERA), lambda: go(chosen.value))
+        add_button(gui, "Go to the photo", "camera", lambda: go(chosen.value))
 
     def _record(self) -> None:
-        from viser import Icon
-
         gui = self.client.gui
         gui.add_markdown("**Screenshot** of the current view, as PNG")
         height = gui.add_number("Height", 1080, min=SCREENSHOT_HEIGHTS[0], max=SCREENSHOT_HEIGHTS[1], step=1)
-        shot = gui.add_button("Save screenshot", icon=Icon.PHOTO, hint="The width follows from the shape of the window")
-        on_click(shot, lambda: self._take_screenshot(height.value))
+        hint = "The width follows from the shape of the window"
+        add_button(gui, "Save screenshot", "photo", lambda: self._take_screenshot(height.value), hint=hint)
         if self.viewer.save_path is not None:
             gui.add_divider()
             self.path = PathEditor(self, self.viewer.save_path)
