@@ -251,9 +251,9 @@ class Train:
         if self.tensorboard:
             check_package("--tensorboard", "tensorboard", "tensorboard")
         if self.view:
-            from nexwarp.viewer import check_server
+            from nexwarp.viewer import listen
 
-            check_server(self.host, self.port)
+            listen(self.host, self.port).close()
 
     def _viewer(
         self, runner: StageRunner, scene: Scene, record: RunRecord, run: Path, console: Console

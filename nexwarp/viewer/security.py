@@ -17,10 +17,11 @@ import http
 import ipaddress
 import logging
 import secrets
+import socket
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import parse_qs, urlsplit
 
 import websockets.asyncio.server as web
@@ -130,18 +131,19 @@ class Gate:
         self.is_open = False  # requests are answered
 
     @contextlib.contextmanager
-    def before_viser(self) -> Iterator[None]:
-        """Inside the context, put the gate before the server that viser starts; viser has no public way to do so."""
+    def before_viser(self, listener: socket.socket) -> Iterator[None]:
+        """Inside the context, put the gate before the server that viser starts, and let it serve on a socket.
+
+        viser has no public way to do so.
+        """
         serve = web.serve
 
         # viser's own arguments: its handler of WebSockets and its pages as `process_request`.
-        def guarded(
-            handler: Handler, host: str, port: int, *, process_request: Process, **options: object
-        ) -> web.serve:
+        def guarded(handler: Handler, _host: str, _port: int, *, process_request: Process, **options: Any) -> web.serve:
             self.attached = True
             options |= {"max_size": MAX_MESSAGE_BYTES, "close_timeout": CLOSE_SECONDS}
             answer = partial(self._answer, process_request)
-            return serve(handler, host, port, process_request=answer, **options)  # type: ignore[arg-type]
+            return serve(handler, sock=listener, process_request=answer, **options)
 
         web.serve = guarded  # type: ignore[assignment, misc]
         try:

@@ -297,9 +297,9 @@ def _reason(error: Exception) -> str:
 def start_server(host: str, port: int) -> tuple["viser.ViserServer", str, "Gate"]:
     """Start viser on exactly this address; return it, the address to open, with a token if it needs one, and its gate.
 
-    The gate admits requests by the rules of security.py, none until `is_open` is set. Errors are of `check_server`.
+    The gate admits requests by the rules of security.py, none until `is_open` is set. Errors are of `listen`.
     """
-    address = check_server(host, port)
+    listener = listen(host, port)
     import viser
 
     from nexwarp.viewer.security import Access, Gate, accept_only_known
@@ -307,46 +307,37 @@ def start_server(host: str, port: int) -> tuple["viser.ViserServer", str, "Gate"
     # Broken connections and invalid messages are errors of the page: they are not logged.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", ".* on a closed connection", UserWarning)  # a tab was closed
+    address, bound = listener.getsockname()[:2]
     gate = Gate(Access.to(address))
-    with contextlib.redirect_stdout(io.StringIO()), gate.before_viser():  # drops its banner
-        server = viser.ViserServer(host=address, port=port, verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()), gate.before_viser(listener):  # drops its banner
+        server = viser.ViserServer(host=address, port=bound, verbose=False)
     if not gate.attached:
         server.stop()
         raise ValueError(f"the viewer needs viser as in constraints.txt, found {viser.__version__}")
-    if port and server.get_port() != port:  # the port was taken after the check; viser chose the next one
-        server.stop()
-        raise _in_use(host, port)
     accept_only_known(server)
-    return server, _url(address, server.get_port(), gate.access.token), gate
+    return server, _url(address, bound, gate.access.token), gate
 
 
-def check_server(host: str, port: int) -> str:
-    """Return the numeric address of a host, an IPv4 one if it has several; viser would resolve it again.
+def listen(host: str, port: int) -> socket.socket:
+    """Return a socket that listens on an address of a host, an IPv4 one if it has several; viser would try other ports.
 
-    ValueError: viser is missing, or the address cannot be used; viser itself would try other ports.
+    ValueError: viser is missing, or the address cannot be used.
     """
     check_package("the viewer", "viser", "viewer")
     if not 0 <= port <= 65535:
         raise ValueError(f"--port: expected 0 to 65535, got {port}")
     try:
         addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, kind, protocol, _, address = min(addresses, key=lambda entry: entry[0] != socket.AF_INET)
-        with socket.socket(family, kind, protocol) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(address)
-            probe.listen()
-        return socket.getnameinfo(address, socket.NI_NUMERICHOST | socket.NI_NUMERICSERV)[0]
+        family, *_, address = min(addresses, key=lambda entry: entry[0] != socket.AF_INET)
+        return socket.create_server(address, family=family)
     except (OSError, UnicodeError) as error:  # UnicodeError: a name that DNS cannot hold
         number = getattr(error, "errno", None)
         if number == errno.EADDRINUSE:
-            raise _in_use(host, port) from None
+            expected = f"--port: expected a free port, but {port} is in use on {host}"
+            raise ValueError(f"{expected}; give another --port") from None
         if number in (errno.EACCES, errno.EPERM):
             raise ValueError(f"--port: expected a port that may be used, but {port} is refused ({error})") from None
         raise ValueError(f"--host: expected an address of this machine, got {host!r} ({error})") from None
-
-
-def _in_use(host: str, port: int) -> ValueError:
-    return ValueError(f"--port: expected a free port, but {port} is in use on {host}; give another --port")
 
 
 def _url(address: str, port: int, token: str) -> str:
