@@ -41,38 +41,9 @@ def sign(x: Any):
 
 
 @wp.func
-def signs(x: Any):
-    return type(x)(sign(x[0]), sign(x[1]), sign(x[2]))
-
-
-@wp.func
-def clamped_color(x: Any):
-    return type(x)(clamped(x[0]), clamped(x[1]), clamped(x[2]))
-
-
-@wp.func
-def clamped_color_backward(x: Any, grad: Any):
-    return type(x)(clamped_backward(x[0], grad[0]), clamped_backward(x[1], grad[1]), clamped_backward(x[2], grad[2]))
-
-
-@wp.func
-def channel_difference(x: Any, y: Any, saturation: Any):
-    """X - y, or 0 where y is saturated and x brighter."""
-    return wp.where(y >= saturation and x > y, type(x)(0.0), x - y)
-
-
-@wp.func
 def difference(x: Any, y: Any, saturation: Any):
-    return type(x)(
-        channel_difference(x[0], y[0], saturation),
-        channel_difference(x[1], y[1], saturation),
-        channel_difference(x[2], y[2], saturation),
-    )
-
-
-@wp.func
-def distance(x: Any):
-    return wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
+    """X - y of a channel, or 0 where y is saturated and x brighter."""
+    return wp.where(y >= saturation and x > y, type(x)(0.0), x - y)
 
 
 @wp.func
@@ -99,13 +70,13 @@ def photometric(first: int, given: Compared, scales: vec3, saturation: real, pix
     if p < pixels:
         weight = total(given.weights, p)
         if scales[0] != ZERO:
-            terms[0] = distance(difference(clamped_color(given.image[p]), given.target[p], saturation)) * scales[0]
+            for c in range(3):
+                terms[0] += wp.abs(difference(clamped(given.image[p][c]), given.target[p][c], saturation))
         if scales[1] != ZERO:
-            terms[1] = (
-                distance(difference(given.textured[p] / (weight + WEIGHT_EPSILON), given.target[p], saturation))
-                * scales[1]
-            )
-        terms[2] = (ONE - weight) * scales[2]
+            seen = given.textured[p] / (weight + WEIGHT_EPSILON)
+            for c in range(3):
+                terms[1] += wp.abs(difference(seen[c], given.target[p][c], saturation))
+        terms = wp.cw_mul(vec3(terms[0], terms[1], ONE - weight), scales)
     write_sum(sums, 0, p, terms[0])
     write_sum(sums, 1, p, terms[1])
     write_sum(sums, 2, p, terms[2])
@@ -123,15 +94,20 @@ def photometric_backward(
     grads: Compared,
 ):
     p = first + wp.tid()
+    pull = vec3()
     if grads.image:
-        color = given.image[p]
-        grad = signs(difference(clamped_color(color), given.target[p], saturation)) * (grad_l1[0] * scales[0])
-        grads.image[p] = clamped_color_backward(color, grad)
+        for c in range(3):
+            value = given.image[p][c]
+            apart = sign(difference(clamped(value), given.target[p][c], saturation))
+            pull[c] = clamped_backward(value, apart * (grad_l1[0] * scales[0]))
+        grads.image[p] = pull
     change = real(0.0)
     if grad_texture:
         divisor = total(given.weights, p) + WEIGHT_EPSILON
         seen = given.textured[p] / divisor
-        pull = signs(difference(seen, given.target[p], saturation)) * (grad_texture[0] * scales[1]) / divisor
+        for c in range(3):
+            apart = sign(difference(seen[c], given.target[p][c], saturation))
+            pull[c] = apart * (grad_texture[0] * scales[1]) / divisor
         change -= wp.dot(pull, seen)
         if grads.textured:
             grads.textured[p] = pull

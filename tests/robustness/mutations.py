@@ -57,7 +57,7 @@ MUTATIONS = [
     Mutation(KERNELS + "detail.py", "opacity * x * y, wp.vector", "opacity * x, wp.vector", "tests/ops/test_antialias.py"),
     Mutation(KERNELS + "adam.py", "* correction + epsilon)", "+ epsilon)", "tests/ops/test_adam.py"),
     Mutation(KERNELS + "adam.py", "(root(v[k]) * correction + epsilon)", "((root(v[k]) + epsilon) * correction)", "tests/ops/test_adam.py -k epsilon"),
-    Mutation(KERNELS + "photometric.py", "(ONE - weight) * scales[2]", "weight * scales[2]", "tests/ops/test_photometric.py"),
+    Mutation(KERNELS + "photometric.py", "terms[1], ONE - weight)", "terms[1], weight)", "tests/ops/test_photometric.py"),
     Mutation(KERNELS + "ssim.py", "C2 = 0.03**2", "C2 = 0.01**2", "tests/train/test_losses.py tests/kernels/test_ssim.py"),
     Mutation(KERNELS + "project.py", "b = wp.cross(center, v1)", "b = wp.cross(center, v2)", AGREE),
     Mutation(KERNELS + "tiles.py", "wp.constant(wp.float64(0.999))", "wp.constant(wp.float64(1.5))", AGREE),
