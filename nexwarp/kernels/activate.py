@@ -1,6 +1,6 @@
 """Activation: raw parameters to what the passes read, all in one go. One thread a surfel, forward and backward.
 
-The backward kernel writes what `wp.grad` gives for the product of outputs and their gradients; nothing is added up.
+The backward kernel takes derivatives by `wp.grad`, but for exponentials, which are their own; nothing is added up.
 """
 
 from __future__ import annotations
@@ -35,31 +35,15 @@ def sigmoid(x: Real):
 
 
 @wp.func
-def activated_dot(
-    quat: Vec4,
-    scale: Vec2,
-    opacity: Real,
-    gamma: Vec2,
-    grad_quat: Vec4,
-    grad_scale: Vec2,
-    grad_opacity: Real,
-    grad_gamma: Vec2,
-):
-    """Sum of outputs * gradients (a constant is left out): its gradient is the vector-Jacobian product."""
-    return (
-        unit_dot(quat, grad_quat)
-        + wp.exp(scale[0]) * grad_scale[0]
-        + wp.exp(scale[1]) * grad_scale[1]
-        + sigmoid(opacity) * grad_opacity
-        + wp.exp(gamma[0]) * grad_gamma[0]
-        + wp.exp(gamma[1]) * grad_gamma[1]
-    )
-
-
-@wp.func
 def unit_dot(quat: Vec4, grad: Vec4):
     """Unit quaternion times its gradient: its gradient is the vector-Jacobian product."""
     return wp.dot(unit(quat), grad)
+
+
+@wp.func
+def sigmoid_dot(x: Real, grad: Real):
+    """Sigmoid times its gradient, likewise."""
+    return sigmoid(x) * grad
 
 
 @per_real()
@@ -74,17 +58,9 @@ def activate(first: int, raw: Parameters, activated: Parameters):
 @per_real()
 def activate_backward(first: int, raw: Parameters, grads: Parameters, grad_raw: Parameters):
     i = first + wp.tid()
-    quat, scale, opacity, gamma, _q, _s, _o, _g = wp.grad(activated_dot)(
-        raw.quats[i],
-        raw.scales[i],
-        raw.opacities[i],
-        raw.gammas[i],
-        grads.quats[i],
-        grads.scales[i],
-        grads.opacities[i],
-        grads.gammas[i],
-    )
+    quat, _unit = wp.grad(unit_dot)(raw.quats[i], grads.quats[i])
+    opacity, _sigmoid = wp.grad(sigmoid_dot)(raw.opacities[i], grads.opacities[i])
     grad_raw.quats[i] = quat
-    grad_raw.scales[i] = scale
+    grad_raw.scales[i] = wp.cw_mul(exponentials(raw.scales[i]), grads.scales[i])
     grad_raw.opacities[i] = opacity
-    grad_raw.gammas[i] = gamma
+    grad_raw.gammas[i] = wp.cw_mul(exponentials(raw.gammas[i]), grads.gammas[i])
