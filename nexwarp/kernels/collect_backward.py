@@ -43,26 +43,29 @@ from nexwarp.native.warp import any_in_warp, lane_index, warp_max, warp_record_s
 
 
 @func_per_real
+def add_rows(rows: Any, slot: int, a: vec4, b: vec4, n: vec4, c: vec4, bad: ints):
+    """Add the sum over a warp of four rows to those of a slot."""
+    if wp.static(fixed_point):
+        fixed_point_record_sum(rows, slot, a, b, n, c, bad)
+    else:
+        warp_record_sum(rows, slot, a, b, n, c)
+
+
+@func_per_real
 def add(sums: Any, i: int, k: int, a: vec4, b: vec4, n: vec4, c: vec4):
-    """Add the sum over a warp of records' gradients to the slot of place k, or of surfel i; return the slot."""
+    """Add records' gradients to the slot of place k, or of surfel i; return the slot."""
     slot = int(i)
     if wp.static(by_place):
         slot = sums.slots[k]
-    if wp.static(fixed_point):
-        fixed_point_record_sum(sums.records, slot, a, b, n, c, sums.bad)
-    else:
-        warp_record_sum(sums.records, slot, a, b, n, c)
+    add_rows(sums.records, slot, a, b, n, c, sums.bad)
     return slot
 
 
 @func_per_real
 def add_channels(sums: Any, slot: int, grad: mat44):
-    """Add the sum over a warp of channels' gradients to a slot, in a wide walk."""
+    """Add channels' gradients to a slot, in a wide walk."""
     if wp.static(wide):
-        if wp.static(fixed_point):
-            fixed_point_record_sum(sums.channels, slot, grad[0], grad[1], grad[2], grad[3], sums.bad)
-        else:
-            warp_record_sum(sums.channels, slot, grad[0], grad[1], grad[2], grad[3])
+        add_rows(sums.channels, slot, grad[0], grad[1], grad[2], grad[3], sums.bad)
 
 
 @func_per_real

@@ -47,9 +47,10 @@ def hash_slot(corner: wp.vec3i, j: int, mask: wp.uint32):
 
 
 @wp.func
-def floor_of(x: Any):
-    """The corner of a point's cell with the lowest coordinates."""
-    return type(x)(wp.floor(x[0]), wp.floor(x[1]), wp.floor(x[2]))
+def cell_of(x: Any):
+    """(corner with the lowest coordinates of a point's cell, where the point lies in it), in units of cells."""
+    base = type(x)(wp.floor(x[0]), wp.floor(x[1]), wp.floor(x[2]))
+    return wp.vec3i(int(base[0]), int(base[1]), int(base[2])), x - base
 
 
 @wp.func
@@ -137,11 +138,8 @@ def hashgrid(
     depth = depths[p]
     if depth > ZERO:
         scale = resolutions[level]
-        x = positions[p] * scale
-        base = floor_of(x)
-        corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
-        x -= base
-        value = interpolate(x, gather(table, level, corner, mask), scale, depth, focal[0])
+        corner, fraction = cell_of(positions[p] * scale)
+        value = interpolate(fraction, gather(table, level, corner, mask), scale, depth, focal[0])
     for k in range(wp.static(features)):
         encoded[level * features + k, p] = storage(value[k])
 
@@ -179,13 +177,9 @@ def hashgrid_backward(  # noqa: PLR0913  # a kernel entry point
         for k in range(wp.static(features)):
             grad[k] = real(grad_encoded[level * features + k, p]) * unscale[0]
         scale = resolutions[level]
-        x = positions[p] * scale
-        base = floor_of(x)
-        corner = wp.vec3i(int(base[0]), int(base[1]), int(base[2]))
-        x -= base
-        gx, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(
-            x, gather(table, level, corner, mask), scale, depth, focal[0], grad
-        )
+        corner, fraction = cell_of(positions[p] * scale)
+        corners = gather(table, level, corner, mask)
+        gx, gc, _s, gd, _f, _g = wp.grad(interpolate_dot)(fraction, corners, scale, depth, focal[0], grad)
         scatter(grad_table, level, corner, mask, gc, units, bad)
         total += vec4(gx[0] * scale, gx[1] * scale, gx[2] * scale, gd)
     if grad_points.shape[0] > 0:
