@@ -17,7 +17,7 @@ import warp as wp
 from nexwarp.kernels.activate import unit
 from nexwarp.kernels.shape import reach
 from nexwarp.kernels.surfel import axes, intrinsics_of, rotate, translation
-from nexwarp.kernels.types import Real, Vec3, Vec4, per_real
+from nexwarp.kernels.types import Real, Vec2, Vec3, Vec4, per_real
 from nexwarp.native.vector_loads import load_pair
 from nexwarp.native.warp import tile_size
 
@@ -66,9 +66,8 @@ def clip(i: int, quad: Any, plane: Real, intrinsics: Vec4, corners: Any):
     nearest = type(plane)(HUGE)
     count = int(0)
     for k in range(4):
-        j = (k + 1) % 4
-        p = wp.vector(quad[k, 0], quad[k, 1], quad[k, 2])
-        q = wp.vector(quad[j, 0], quad[j, 1], quad[j, 2])
+        p = quad[k]
+        q = quad[(k + 1) % 4]
         if p[2] >= plane:
             x = pixel_of_point(p, intrinsics)
             corners[i, count] = x
@@ -121,10 +120,7 @@ def tile_polygon(
     for k in range(4):
         s1 = wp.where(k == 0 or k == 3, ONE, -ONE)
         s2 = wp.where(k < 2, ONE, -ONE)
-        corner = center + v1 * s1 + v2 * s2
-        quad[k, 0] = corner[0]
-        quad[k, 1] = corner[1]
-        quad[k, 2] = corner[2]
+        quad[k] = center + v1 * s1 + v2 * s2
     count, low, high, nearest = clip(i, quad, near_plane(near, center), intrinsics, polygons.corners)
     if count == 0:
         return
@@ -148,6 +144,16 @@ def tile_polygon(
 
 
 @wp.func
+def reached(low: Real, high: Real, p: Vec2, q: Vec2, y: Real):
+    """(least, largest) x with that of the edge from p to q at a height y, if it gets there."""
+    if (p[1] < y) != (q[1] < y):
+        x = p[0] + (q[0] - p[0]) * ((y - p[1]) / (q[1] - p[1]))
+        low = wp.min(low, x)
+        high = wp.max(high, x)
+    return low, high
+
+
+@wp.func
 def span(i: int, row: int, tile_columns: int, count: int, polygons: Any):
     """First and last tile of a tile row that the tile polygon touches; first > last when none."""
     margin = polygons.margins[i]
@@ -165,14 +171,8 @@ def span(i: int, row: int, tile_columns: int, count: int, polygons: Any):
             if q[1] >= top and q[1] <= bottom:
                 low = wp.min(low, q[0])
                 high = wp.max(high, q[0])
-            if (p[1] < top) != (q[1] < top):
-                x = p[0] + (q[0] - p[0]) * ((top - p[1]) / (q[1] - p[1]))
-                low = wp.min(low, x)
-                high = wp.max(high, x)
-            if (p[1] > bottom) != (q[1] > bottom):
-                x = p[0] + (q[0] - p[0]) * ((bottom - p[1]) / (q[1] - p[1]))
-                low = wp.min(low, x)
-                high = wp.max(high, x)
+            low, high = reached(low, high, p, q, top)
+            low, high = reached(low, high, p, q, bottom)
             p = q
     if not (low <= high):
         return wp.vec2i(0, -1)
