@@ -96,18 +96,16 @@ class Lens:
         if not (0 < self.width <= MAX_SIDE and 0 < self.height <= MAX_SIDE):
             raise ValueError(f"expected an image size of 1 to {MAX_SIDE} pixels, got {self.width}x{self.height}")
         if self.model == BROWN:
-            fitting, expected, focal_places = len(self.params) == len(BROWN_PARAMS), ", ".join(BROWN_PARAMS), [0, 1]
+            fitting, expected = len(self.params) == len(BROWN_PARAMS), ", ".join(BROWN_PARAMS)
         elif self.model == "INVALID" or self.model not in pycolmap_module().CameraModelId.__members__:
             raise ValueError(f"camera model {self.model} is unknown to COLMAP")
         else:
-            camera = self._camera()
-            fitting, expected = camera.verify_params(), camera.params_info
-            focal_places = camera.focal_length_idxs() if fitting else []
+            fitting, expected = self._camera().verify_params(), self._camera().params_info
         if not fitting:
             raise ValueError(f"camera model {self.model}: expected {expected}, got {len(self.params)} values")
         if not all(map(math.isfinite, self.params)):
             raise ValueError(f"camera model {self.model}: expected finite parameters, got {self.params}")
-        focal = [self.params[index] for index in focal_places]
+        focal = [self.params[index] for index in self._camera().focal_length_idxs()]
         if min(focal, default=1.0) <= 0:
             raise ValueError(f"K: expected focal lengths > 0, got {', '.join(f'{f:g}' for f in focal)}")
         if min(focal, default=1.0) < MIN_FOCAL or max(map(abs, self.params), default=1.0) > MAX_PARAMETER:
@@ -130,7 +128,8 @@ class Lens:
         if self.model == PANORAMA:
             side = max(round(self.width / math.pi), 1)
             return Intrinsics(side / 2, side / 2, side / 2, side / 2, side, side)
-        focal, centre = self._pinhole()
+        K = self._camera().calibration_matrix()
+        focal, centre = [K[0, 0], K[1, 1]], [K[0, 2], K[1, 2]]
         if not self.distorted:
             return Intrinsics(focal[0], focal[1], centre[0], centre[1], self.width, self.height)
         photo, sides = (self.width, self.height), [1, 1]
@@ -196,16 +195,11 @@ class Lens:
         bent_y = y * radial + 2 * p2 * x * y + p1 * (r + 2 * y * y)
         return np.stack([bent_x, bent_y], axis=1)
 
-    def _pinhole(self) -> tuple[list[float], list[float]]:
-        """Focal lengths and principal point without the distortion."""
-        if self.model == BROWN:
-            return list(self.params[:2]), list(self.params[2:4])
-        K = self._camera().calibration_matrix()
-        return [K[0, 0], K[1, 1]], [K[0, 2], K[1, 2]]
-
     def _camera(self) -> "pycolmap.Camera":
+        """COLMAP's camera; of BROWN the one that has all but the last two coefficients."""
+        model, params = ("OPENCV", self.params[:8]) if self.model == BROWN else (self.model, self.params)
         camera: pycolmap.Camera = pycolmap_module().Camera(
-            model=self.model, width=self.width, height=self.height, params=list(self.params)
+            model=model, width=self.width, height=self.height, params=list(params)
         )
         return camera
 
