@@ -186,7 +186,12 @@ def _loaded(path: Path, upright: bool = False) -> Iterator["PIL.Image.Image"]:
 
 
 def read_image(path: Path, white: float | None = None) -> torch.Tensor:
-    """Read a photo (H, W, 3) uint8 sRGB as COLMAP does: without EXIF orientation, grey repeated, alpha dropped.
+    """Read a photo (H, W, 3) uint8 sRGB as COLMAP does; see `read_transparent`."""
+    return read_transparent(path, white)[0]
+
+
+def read_transparent(path: Path, white: float | None = None) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Read a photo (H, W, 3) uint8 sRGB without EXIF orientation, grey repeated, and its alpha (H, W) uint8, or None.
 
     With `white` the file holds linear light, of which this value becomes white; what is brighter is clipped. The
     largest number of 8 or 16 bits a channel is 1. OpenEXR files hold linear light always, with a `white` of 1 if None.
@@ -195,7 +200,8 @@ def read_image(path: Path, white: float | None = None) -> torch.Tensor:
     """
     if white is None and path.suffix.lower() != EXR:
         with _loaded(path) as image:
-            return torch.from_numpy(_to_rgb(image))
+            alpha = _alpha(image)
+            return torch.from_numpy(_to_rgb(image)), None if alpha is None else torch.from_numpy(alpha)
     width, height = image_size(path)
     if width * height > MAX_PIXELS:
         raise ValueError(f"{path}: expected an image of at most {MAX_PIXELS // 10**6} megapixels, got more")
@@ -205,7 +211,7 @@ def read_image(path: Path, white: float | None = None) -> torch.Tensor:
         linear = torch.from_numpy(load_deep(path).astype(np.float32) / 65535)
     else:
         linear = read_image(path).float() / 255
-    return to_uint8(display_light((linear / (white or 1.0)).clamp(0, 1)))
+    return to_uint8(display_light((linear / (white or 1.0)).clamp(0, 1))), None
 
 
 def copy_upright(path: Path, target: Path) -> torch.Tensor:
@@ -229,20 +235,6 @@ def copy_upright(path: Path, target: Path) -> torch.Tensor:
     except (ValueError, TypeError, struct.error):  # EXIF that PIL cannot write, as above 64 KB
         copy.save(target, quality=COPY_QUALITY, subsampling=0)
     return torch.from_numpy(pixels)
-
-
-def read_transparent(path: Path, white: float | None = None) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Read a photo as `read_image`, and its (H, W) uint8 alpha; None if the file has none, or holds linear light."""
-    if white is not None or path.suffix.lower() == EXR:
-        return read_image(path, white), None
-    with _loaded(path) as image:
-        if not image.has_transparency_data:
-            return torch.from_numpy(_to_rgb(image)), None
-        if image.mode.startswith("I"):  # PNG files with one transparent value of 16 bits
-            alpha = np.where(np.asarray(image) == image.info["transparency"], 0, 255).astype(np.uint8)
-            return torch.from_numpy(_to_rgb(image)), torch.from_numpy(alpha)
-        rgba = np.array(_to_rgba(image))
-        return torch.from_numpy(rgba[:, :, :3].copy()), torch.from_numpy(rgba[:, :, 3].copy())
 
 
 def read_mask(path: Path) -> torch.Tensor:
@@ -290,6 +282,15 @@ def _on_black(image: "PIL.Image.Image") -> "PIL.Image.Image":
     if not image.has_transparency_data:
         return image
     return Image.alpha_composite(Image.new("RGBA", image.size, (0, 0, 0, 255)), _to_rgba(image))
+
+
+def _alpha(image: "PIL.Image.Image") -> np.ndarray | None:
+    """Return the alpha (H, W) uint8 of an image; None if it has none."""
+    if not image.has_transparency_data:
+        return None
+    if image.mode.startswith("I"):  # PNG files with one transparent value of 16 bits
+        return np.where(np.asarray(image) == image.info["transparency"], 0, 255).astype(np.uint8)
+    return np.array(_to_rgba(image).getchannel("A"))
 
 
 def _to_rgba(image: "PIL.Image.Image") -> "PIL.Image.Image":

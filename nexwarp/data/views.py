@@ -19,7 +19,6 @@ from nexwarp.data.images import (
     downscale_image,
     downscale_mask,
     image_size,
-    read_image,
     read_mask,
     read_transparent,
     resize_nearest,
@@ -151,10 +150,7 @@ class ViewReader:
     def _pixels(self, plan: PlannedView) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
         """Read image, alpha and mask, undistort and reduce them."""
         photo = plan.photo
-        if self.background is None and not self.alpha_mask:
-            image, alpha = read_image(photo.file, self.white), None
-        else:
-            image, alpha = read_transparent(photo.file, self.white)
+        image, alpha = read_transparent(photo.file, self.white)
         mask = _mask(photo, image, alpha if self.alpha_mask else None)
         if self.background is None or (alpha is not None and bool((alpha == OPAQUE).all())):
             alpha = None

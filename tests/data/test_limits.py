@@ -284,7 +284,7 @@ def test_photos_that_do_not_fit_are_refused_before_they_are_read(tmp_path, monke
     (path / "images_2").mkdir()
     need = 10 * 48 * 36 * 3
     monkeypatch.setattr(nexwarp.data.scene, "available_memory", lambda: need // 3)
-    monkeypatch.setattr(nexwarp.data.views, "read_image", lambda *_: pytest.fail("read"))
+    monkeypatch.setattr(nexwarp.data.views, "read_transparent", lambda *_: pytest.fail("read"))
     with pytest.raises(ValueError, match=r"10 photos of up to 48x36 .* use downscale=2 \(.*\) or .* \(images_2\)") as e:
         load_scene(path)
     assert "\n" not in str(e.value)
