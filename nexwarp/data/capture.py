@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
@@ -35,7 +36,17 @@ class Photo:
     mask: Path | None = None  # None if the scene names none
     depth: Path | None = None  # its depth map; None if it has none
     face: str | None = None  # of a panorama, a key of `nexwarp.data.lens.FACES`; None for other photos
-    points: np.ndarray | None = None  # (M, 3) float32 world positions that were triangulated from it; None if unknown
+    points: np.ndarray | None = None  # (M,) indices of the cloud's points triangulated from it; None if unknown
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Positions (N, 2) of points (N, 3), in shares of the photo's width and height; NaN for those it does not show.
+
+        The points are in the frame of `viewmat`; something may hide them.
+        """
+        pixels = self.lens.project(points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3])
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels >= 0) & (pixels < [self.lens.width, self.lens.height])).all(axis=1, keepdims=True)
+        return np.where(inside, pixels / [self.lens.width, self.lens.height], np.nan)
 
 
 @dataclass(frozen=True)
@@ -78,8 +89,14 @@ class Capture:
         test: frozenset[str] | None = None,
         background: tuple[float, float, float] | None = None,
     ) -> "Capture":
-        """Sort photos by name, and move photos and cloud from the world frame to one near them where that is needed."""
+        """Sort photos by name, and move photos and cloud from the world frame to one near them where that is needed.
+
+        ValueError: two photos have one name.
+        """
         photos = sorted(photos, key=lambda photo: photo.name)
+        for photo, following in pairwise(photos):
+            if photo.name == following.name:
+                raise ValueError(f"{source}: expected each photo once, got {photo.name} twice")
         cloud = cloud if cloud is not None and len(cloud.positions) else None
         largest = max((max(photo.lens.width, photo.lens.height) for photo in photos), default=0)
         origin = far_origin([photo.viewmat for photo in photos], largest, cloud)
@@ -224,16 +241,6 @@ def plain_name(name: str) -> str:
 def listed(names: Sequence[str], most: int) -> str:
     """The first names of many, for messages."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" * (len(names) > most))
-
-
-def distinct_photos(source: Path, photos: Iterable[Photo]) -> list[Photo]:
-    """Return photos as a list; raise ValueError at the first one whose name came before."""
-    by_name: dict[str, Photo] = {}
-    for photo in photos:
-        if photo.name in by_name:
-            raise ValueError(f"{source}: expected each photo once, got {photo.name} twice")
-        by_name[photo.name] = photo
-    return list(by_name.values())
 
 
 def check_points(source: Path, positions: np.ndarray, what: str, name: Callable[[int], str]) -> None:

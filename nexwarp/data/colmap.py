@@ -11,6 +11,7 @@ import warnings
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import NamedTuple, TypeAlias, TypeVar
@@ -23,12 +24,11 @@ from nexwarp.data.capture import (
     Cloud,
     Photo,
     check_points,
-    distinct_photos,
     find_file,
     inside_folder,
     safe_name,
 )
-from nexwarp.data.lens import Lens, camera_models
+from nexwarp.data.lens import Lens, camera_models, pycolmap_module
 from nexwarp.data.ply import read_ply
 
 PARTS = ("cameras", "images", "points3D")
@@ -45,6 +45,7 @@ POINTS = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error",
 
 CameraRecord: TypeAlias = tuple[str, tuple[float, ...], int, int]  # the arguments of `Lens`
 Record = TypeVar("Record")
+Reader: TypeAlias = Callable[[Path], Iterator[tuple[int, Record]]]  # of the records in a file, each with its id
 
 
 class ImageRecord(NamedTuple):
@@ -115,25 +116,24 @@ def read_model(path: Path, images: Path, follow_links: bool = False, need_points
     """
     folder, suffix, points_file = _find_model(path, need_points)
     in_ply = points_file is not None and points_file.name == POINTS_PLY
-    read = _read_binary if suffix == "bin" else _read_text
-    cameras, records, points = read(folder, points_file is not None and not in_ply)
-    cloud = None
+    read_cameras, read_images, read_points = READERS[suffix]
+    cameras = _unique(folder / f"cameras.{suffix}", read_cameras)
+    records = _unique(folder / f"images.{suffix}", read_images)
+    cloud = points = None
     if points_file is not None and in_ply:
         cloud = read_ply(inside_folder(f"{folder}:", points_file, path, follow_links))
+    elif points_file is not None:
+        points = read_points(points_file)
     if not records:
         raise ValueError(f"{folder}: the COLMAP model has no registered images")
     lenses: dict[int, Lens] = {}
-    each = (_photo(image, cameras, lenses, folder, images, follow_links) for image in records.values())
-    photos = distinct_photos(folder, each)
-    if points is None or not len(points.table):
-        return Capture.of(folder, photos, cloud)
-    points = _without_strays(points, records, folder)
-    capture = Capture.of(folder, photos, _cloud(points.table, folder))
-    assert capture.cloud is not None
-    seen = _seen(points, records, capture.cloud.positions.astype(np.float32))
-    points_of = {photo.name: positions for photo, positions in zip(photos, seen, strict=True)}
-    photos = [dataclasses.replace(photo, points=points_of[photo.name]) for photo in capture.photos]
-    return dataclasses.replace(capture, photos=photos)
+    photos = [_photo(image, cameras, lenses, folder, images, follow_links) for image in records.values()]
+    if points is not None and len(points.table):
+        points = _without_strays(points, records, folder)
+        cloud = _cloud(points.table, folder)
+        seen = _seen(points, records)
+        photos = [dataclasses.replace(photo, points=indices) for photo, indices in zip(photos, seen, strict=True)]
+    return Capture.of(folder, photos, cloud)
 
 
 def _photo(
@@ -164,13 +164,8 @@ def _viewmat(where: str, pose: tuple[float, ...]) -> np.ndarray:
         raise ValueError(f"{where}: expected a finite pose with a rotation, got {pose}")
     quat /= np.abs(quat).max()
     w, x, y, z = quat / np.linalg.norm(quat)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    viewmat[:3, 3] = shift
+    pycolmap, viewmat = pycolmap_module(), np.eye(4)
+    viewmat[:3] = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), shift).matrix()
     return viewmat
 
 
@@ -190,9 +185,9 @@ def _without_strays(points: PointRecords, images: dict[int, ImageRecord], folder
     return PointRecords(points.table, points.seen_by[known], kept)
 
 
-def _seen(points: PointRecords, images: dict[int, ImageRecord], positions: np.ndarray) -> list[np.ndarray]:
-    """For each image, those (M, 3) of the positions (P, 3) that were triangulated from it, by ascending id."""
-    count = len(positions)
+def _seen(points: PointRecords, images: dict[int, ImageRecord]) -> list[np.ndarray]:
+    """For each image, the ascending indices (M,) of the points that were triangulated from it."""
+    count = len(points.table)
     identities = np.array(list(images), np.int64)
     ascending = np.argsort(identities)
     # Observations are the largest arrays of a model, so they are processed in place.
@@ -203,7 +198,7 @@ def _seen(points: PointRecords, images: dict[int, ImageRecord], positions: np.nd
     pairs.sort()
     pairs = pairs[np.concatenate([[True], pairs[1:] != pairs[:-1]])[: len(pairs)]]
     ends = np.searchsorted(pairs, np.arange(1, len(identities)) * count)
-    seen: list[np.ndarray] = [positions[part % count] for part in np.split(pairs, ends)]
+    seen = [part % count for part in np.split(pairs, ends)]
     return [seen[index] for index in np.argsort(ascending)]
 
 
@@ -224,15 +219,6 @@ def _cloud(table: np.ndarray, folder: Path) -> Cloud:
 # Binary files
 
 
-def _read_binary(
-    folder: Path, points: bool
-) -> tuple[dict[int, CameraRecord], dict[int, ImageRecord], PointRecords | None]:
-    """Read cameras and images by id, and the points, if wanted; ValueError names a damaged file."""
-    cameras = _unique(folder / "cameras.bin", _records(folder / "cameras.bin", _binary_camera))
-    images = _unique(folder / "images.bin", _records(folder / "images.bin", _binary_image))
-    return cameras, images, _binary_points(folder / "points3D.bin") if points else None
-
-
 def _count_images(folder: Path, suffix: str) -> int:
     """Number of registered images of the model in a folder, "bin" or "txt"."""
     if suffix == "txt":
@@ -241,7 +227,7 @@ def _count_images(folder: Path, suffix: str) -> int:
         return int.from_bytes(file.read(8), "little")
 
 
-class _Reader:
+class _MappedFile:
     """A binary file that is mapped into memory, and how far it is read; ValueError where it ends too early."""
 
     def __init__(self, path: Path, content: mmap) -> None:
@@ -268,12 +254,12 @@ class _Reader:
         return self.read((end if end >= 0 else len(self.content)) - self.position + 1)[:-1]
 
 
-def _records(path: Path, read: Callable[[_Reader], Record]) -> Iterator[Record]:
+def _records(read: Callable[[_MappedFile], Record], path: Path) -> Iterator[Record]:
     """Read the records of a binary file, whose number is its first one, to its end."""
     if not path.stat().st_size:
         raise ValueError(f"{path}: truncated or damaged, expected more records than the file holds")
     with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
-        reader = _Reader(path, content)
+        reader = _MappedFile(path, content)
         for _ in range(reader.number()):
             yield read(reader)
         if reader.position != len(content):
@@ -281,10 +267,10 @@ def _records(path: Path, read: Callable[[_Reader], Record]) -> Iterator[Record]:
             raise ValueError(f"{path}: damaged, {sizes}")
 
 
-def _unique(path: Path, records: Iterator[tuple[int, Record]]) -> dict[int, Record]:
-    """Collect records by id; ValueError if an id occurs twice or there are too many."""
+def _unique(path: Path, read: Reader[Record]) -> dict[int, Record]:
+    """Read records by id; ValueError if an id occurs twice or there are too many."""
     by_id: dict[int, Record] = {}
-    for identity, record in records:
+    for identity, record in read(path):
         if identity in by_id:
             raise ValueError(f"{path}: damaged, expected each id once, got {identity} twice")
         by_id[identity] = record
@@ -293,7 +279,7 @@ def _unique(path: Path, records: Iterator[tuple[int, Record]]) -> dict[int, Reco
     return by_id
 
 
-def _binary_camera(file: _Reader) -> tuple[int, CameraRecord]:
+def _binary_camera(file: _MappedFile) -> tuple[int, CameraRecord]:
     identity, model, width, height = CAMERA.unpack(file.read(CAMERA.size))
     if model not in camera_models():
         raise ValueError(f"{file.path}: camera {identity}: expected a camera model that COLMAP knows, got {model}")
@@ -301,7 +287,7 @@ def _binary_camera(file: _Reader) -> tuple[int, CameraRecord]:
     return identity, (name, struct.unpack(f"<{count}d", file.read(8 * count)), width, height)
 
 
-def _binary_image(file: _Reader) -> tuple[int, ImageRecord]:
+def _binary_image(file: _MappedFile) -> tuple[int, ImageRecord]:
     identity, *pose, camera = IMAGE.unpack(file.read(IMAGE.size))
     name = _decoded(file.path, file.text())
     file.skip(24 * file.number())  # keypoints
@@ -311,28 +297,18 @@ def _binary_image(file: _Reader) -> tuple[int, ImageRecord]:
 def _binary_points(path: Path) -> PointRecords:
     heads, tracks = bytearray(), bytearray()
 
-    def read(file: _Reader) -> None:
+    def read(file: _MappedFile) -> None:
         nonlocal heads, tracks
         head = file.read(POINT.size)
         heads += head
         tracks += file.read(8 * int.from_bytes(head[-8:], "little"))
 
-    for _ in _records(path, read):
+    for _ in _records(read, path):
         pass
     return _sorted(path, heads, np.frombuffer(tracks, "<u4")[::2].copy())
 
 
 # Text files
-
-
-def _read_text(
-    folder: Path, points: bool
-) -> tuple[dict[int, CameraRecord], dict[int, ImageRecord], PointRecords | None]:
-    """As `_read_binary`; messages name the line, too."""
-    lines = _lines(folder / "cameras.txt")
-    cameras = _unique(folder / "cameras.txt", (_text_camera(where, line) for where, line in lines))
-    images = _unique(folder / "images.txt", _text_images(folder / "images.txt"))
-    return cameras, images, _text_points(folder / "points3D.txt") if points else None
 
 
 def _lines(path: Path) -> Iterator[tuple[str, bytes]]:
@@ -363,17 +339,18 @@ def _integers(words: Sequence[bytes]) -> list[int]:
         return [int(number) for number in numbers]
 
 
-def _text_camera(where: str, line: bytes) -> tuple[int, CameraRecord]:
-    try:
-        identity, model, width, height, *params = line.split()
-        known = {name.encode(): count for name, count in camera_models().values()}
-        if known.get(model) != len(params):
-            raise ValueError
-        number, columns, rows = _integers((identity, width, height))
-        return number, (model.decode(), tuple(map(float, params)), columns, rows)
-    except ValueError:
-        expected = "id, model, width, height and the model's parameters of a camera"
-        raise _unreadable(where, expected, line) from None
+def _text_cameras(path: Path) -> Iterator[tuple[int, CameraRecord]]:
+    known = {name.encode(): count for name, count in camera_models().values()}
+    for where, line in _lines(path):
+        try:
+            identity, model, width, height, *params = line.split()
+            if known.get(model) != len(params):
+                raise ValueError
+            number, columns, rows = _integers((identity, width, height))
+            yield number, (model.decode(), tuple(map(float, params)), columns, rows)
+        except ValueError:
+            expected = "id, model, width, height and the model's parameters of a camera"
+            raise _unreadable(where, expected, line) from None
 
 
 def _text_images(path: Path) -> Iterator[tuple[int, ImageRecord]]:
@@ -429,3 +406,10 @@ def _decoded(path: Path, name: bytes) -> str:
         return name.decode("utf-8")
     except UnicodeDecodeError:
         raise ValueError(f"{path}: expected image names in UTF-8, got {name[:60]!r}") from None
+
+
+# Readers of cameras and images, with their ids, and of points. ValueError names a damaged file, and a line of text.
+READERS: dict[str, tuple[Reader[CameraRecord], Reader[ImageRecord], Callable[[Path], PointRecords]]] = {
+    "bin": (partial(_records, _binary_camera), partial(_records, _binary_image), _binary_points),
+    "txt": (_text_cameras, _text_images, _text_points),
+}

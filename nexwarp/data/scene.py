@@ -417,7 +417,8 @@ def _read_views(
 ) -> tuple[list[View], list[View]]:
     """Read all photos; return the training views and the test views."""
     alpha_mask = source.masks == ALPHA
-    reader = ViewReader(source.downscale, background, alpha_mask, source.linear)
+    positions = None if capture.cloud is None else capture.cloud.positions.astype(np.float32)
+    reader = ViewReader(source.downscale, background, alpha_mask, source.linear, positions)
     photos = with_depths(path, _with_masks(path, capture.photos, source.masks))
     photos = [dataclasses.replace(x, depth=None) if test else x for x, test in zip(photos, tests, strict=True)]
     plans = read_in_threads(reader.plan, photos, MAX_READERS)
@@ -464,13 +465,8 @@ def _given_points(file: Path, capture: Capture) -> Cloud:
     if not len(cloud.positions):
         raise ValueError(f"{file}: expected at least one vertex, got none")
     sample = cloud.positions[:: -(-len(cloud.positions) // JUDGED_POINTS)]
-
-    def shows(photo: Photo) -> bool:
-        pixels = photo.lens.project(sample @ photo.viewmat[:3, :3].T + photo.viewmat[:3, 3])
-        with np.errstate(invalid="ignore"):
-            return bool(((pixels >= 0) & (pixels < [photo.lens.width, photo.lens.height])).all(axis=1).any())
-
-    if not any(shows(photo) for photo in capture.photos[:: -(-len(capture.photos) // JUDGED_PHOTOS)]):
+    judges = capture.photos[:: -(-len(capture.photos) // JUDGED_PHOTOS)]
+    if not any(np.isfinite(photo.project(sample)).any() for photo in judges):
         warnings.warn(f"{file}: no photo shows any of its points; are they in the scene's world frame?", stacklevel=2)
     return cloud
 

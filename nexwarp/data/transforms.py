@@ -7,6 +7,7 @@ Both hold camera-to-world matrices with OpenGL's camera axes (x right, y up, z b
 import dataclasses
 import re
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -105,36 +106,30 @@ def read_blender(path: Path, images: str, follow_links: bool = False, skip_missi
 
 def _read_frames(file: Path, images: str, follow_links: bool, skip_missing: bool) -> _Frames:
     data = read_object(file, finite=True)
-    entries = list_of(file, data, "frames")
-    tests = [] if data.get("test_frames") is None else list_of(file, data, "test_frames")
-    _name_unread(file, data, entries + tests)
+    entries = {f"frame {index}": entry for index, entry in enumerate(list_of(file, data, "frames"))}
+    if data.get("test_frames") is not None:
+        entries |= {f"test frame {index}": entry for index, entry in enumerate(list_of(file, data, "test_frames"))}
+    _name_unread(file, data, entries.values())
     frames = _Frames(file, data, [], set(), [], _inverse_applied(file, data), follow_links)
-    seen: dict[Path, str] = {}
-    for index, entry in enumerate(entries + tests):
-        where = f"{file}: frame {index}"
-        if index >= len(entries):
-            where = f"{file}: test frame {index - len(entries)}"
-        named = _file_name(where, "file_path", entry.get("file_path"), file.parent)
-        where = f"{where} ({named})"
+    for place, entry in entries.items():
+        named = _file_name(f"{file}: {place}", "file_path", entry.get("file_path"), file.parent)
+        where = f"{file}: {place} ({named})"
         photo_file = _find(where, file.parent, named, images)
         if photo_file is None:
             frames.missing.append(named)
             continue
         name = _view_name(str(PurePosixPath(named).with_name(photo_file.name)))
-        if photo_file in seen:
-            raise ValueError(f"{file}: expected each photo once, got {name} twice")
-        seen[photo_file] = name
         folder = file.parent / images if PurePosixPath(named).is_relative_to("images") else file.parent
         inside_folder(f"{where}: file_path", photo_file, folder, follow_links)
         frames.photos.append(_photo(where, frames, entry, name, photo_file))
-        if index >= len(entries):
+        if place.startswith("test"):
             frames.held_out.add(name)
-    report_missing(file, frames.missing, len(entries + tests), skip_missing)
+    report_missing(file, frames.missing, len(entries), skip_missing)
     frames.photos.sort(key=lambda photo: photo.name)
     return frames
 
 
-def _name_unread(file: Path, data: JsonObject, entries: list[JsonObject]) -> None:
+def _name_unread(file: Path, data: JsonObject, entries: Iterable[JsonObject]) -> None:
     """Warn of keys that have no meaning here."""
     unread = {key for key, value in data.items() if value is not None} - FILE_KEYS
     unread |= {key for entry in entries for key, value in entry.items() if value is not None} - FRAME_KEYS
@@ -248,13 +243,10 @@ def _color_error(points: np.ndarray, colors: np.ndarray, photos: list[Photo]) ->
     sample = np.linspace(0, len(points) - 1, min(len(points), JUDGED_POINTS)).astype(int)
     errors = [np.zeros((0, 3))]
     for photo in photos[:: -(-len(photos) // JUDGED_PHOTOS)]:
-        image = read_image(photo.file).numpy()
-        rotation, shift = photo.viewmat[:3, :3], photo.viewmat[:3, 3]
-        pixels = photo.lens.project(points[sample] @ rotation.T + shift) / [photo.lens.width, photo.lens.height]
-        with np.errstate(invalid="ignore"):
-            inside = ((pixels >= 0) & (pixels < 1)).all(axis=1)
-        column, row = (pixels[inside] * image.shape[1::-1]).astype(int).T
-        errors.append(np.abs(image[row, column].astype(float) - colors[sample][inside]))
+        image, places = read_image(photo.file).numpy(), photo.project(points[sample])
+        shown = np.isfinite(places).all(axis=1)
+        column, row = (places[shown] * image.shape[1::-1]).astype(int).T
+        errors.append(np.abs(image[row, column].astype(float) - colors[sample][shown]))
     error = np.concatenate(errors)
     return float(np.median(error)) if len(error) else 255.0
 
@@ -279,13 +271,13 @@ def _frame_lens(where: str, frame: JsonObject, shared: JsonObject, file: Path) -
         raise ValueError(f"{where}: w, h: expected whole numbers of pixels, got {columns:g}x{rows:g}")
     width, height = int(columns), int(rows)
     model, coefficients = _distortion(where, keys)
+    params: tuple[float, ...] = (width, height)
+    if model != PANORAMA:
+        params = (*intrinsics_of(where, frame, shared, width, height), *coefficients)
     try:
-        if model == PANORAMA:
-            return Lens(model, (float(width), float(height)), width, height)
-        return Lens(model, (*intrinsics_of(where, frame, shared, width, height), *coefficients), width, height)
+        return Lens(model, params, width, height)
     except ValueError as error:
-        text = str(error)
-        raise ValueError(text if text.startswith(where) else f"{where}: {text}") from None
+        raise ValueError(f"{where}: {error}") from None
 
 
 def lens_keys(lens: Lens, width: int, height: int) -> JsonObject | None:

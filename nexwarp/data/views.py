@@ -96,7 +96,8 @@ class ViewReader:
     downscale: int  # factor by which images are reduced, averaging blocks of pixels
     background: tuple[float, float, float] | None  # behind transparent photos; None drops their alpha
     alpha_mask: bool  # use alpha >= 128 as the mask
-    white: float | None = None  # as of `read_image`
+    white: float | None  # as of `read_image`
+    positions: np.ndarray | None  # (P, 3) float32 of the capture's points
 
     def __post_init__(self) -> None:
         self._maps, self._lock = lru_cache(KEPT_MAPS)(undistortion), Lock()
@@ -144,7 +145,9 @@ class ViewReader:
             camera = Camera(viewmat, K.float(), image.shape[1], image.shape[0], near, origin=origin)
         except ValueError as error:
             raise ValueError(f"{photo.file}: the camera of this image is not usable: {error}") from error
-        points = None if photo.points is None else torch.from_numpy(photo.points)
+        points = None
+        if photo.points is not None and self.positions is not None:
+            points = torch.from_numpy(self.positions[photo.points])
         return View(camera, image, mask, photo.name, alpha, points, depth)
 
     def _pixels(self, plan: PlannedView) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
