@@ -92,9 +92,9 @@ def written_aside(path: str | os.PathLike[str], *, durable: bool = True) -> Iter
         remove_empty(created)
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file to a temporary name and rename it: it is complete or absent, even after a power failure."""
-    with written_aside(path) as temporary:
+def write_atomically(path: str | os.PathLike[str], content: bytes, *, durable: bool = True) -> None:
+    """Write a file to a temporary name and rename it: it is complete or absent; see `written_aside`."""
+    with written_aside(path, durable=durable) as temporary:
         temporary.write_bytes(content)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from nexwarp.errors import FormatError, MissingError, StorageError, check_finite
-from nexwarp.io.files import one_line, written_aside
+from nexwarp.io.files import one_line, write_atomically, written_aside
 from nexwarp.io.json_files import parse_json
 from nexwarp.io.video import check_av
 
@@ -44,7 +44,7 @@ def to_uint8(image: torch.Tensor) -> torch.Tensor:
 
 def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
     """Write an (H, W, 3) image, uint8 or float in [0, 1], as a PNG file, atomically; missing folders are created."""
-    _write(path, _encoded(_shown("image", image).numpy(), **PNG))
+    write_atomically(path, _encoded(_shown("image", image).numpy(), **PNG), durable=False)
 
 
 @contextmanager
@@ -58,7 +58,7 @@ def png_files() -> Iterator[Callable[[Path, torch.Tensor], None]]:
 
     def write_first() -> None:
         path, content, _ = coming.popleft()
-        _write(path, content.result())
+        write_atomically(path, content.result(), durable=False)
 
     with ThreadPoolExecutor(THREADS, "pictures") as pool:
 
@@ -79,7 +79,8 @@ def png_files() -> Iterator[Callable[[Path, torch.Tensor], None]]:
 
 def save_jpeg(path: str | os.PathLike[str], image: torch.Tensor, quality: int) -> None:
     """Write an image as a JPEG file of quality 1 to 100 with full colour resolution; see `save_png`."""
-    _write(path, _encoded(_shown("image", image).numpy(), format="JPEG", quality=quality, subsampling=0))
+    content = _encoded(_shown("image", image).numpy(), format="JPEG", quality=quality, subsampling=0)
+    write_atomically(path, content, durable=False)
 
 
 def _encoded(pixels: np.ndarray, **options: Any) -> bytes:
@@ -89,11 +90,6 @@ def _encoded(pixels: np.ndarray, **options: Any) -> bytes:
     content = io.BytesIO()
     Image.fromarray(pixels).save(content, **options)
     return content.getvalue()
-
-
-def _write(path: str | os.PathLike[str], content: bytes) -> None:
-    with written_aside(path, durable=False) as temporary:
-        temporary.write_bytes(content)
 
 
 def save_exr(
@@ -136,21 +132,19 @@ def load_exr(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dic
     path = Path(path)
     if not path.is_file():
         raise MissingError(f"{path}: no such file, expected an OpenEXR file")
-    parts = _parts(path)
-    try:
-        tensors = {name: _tensor(channels) for name, _, channels in parts}
-        metadata = dict(parse_json("metadata", str(parts[0][1][METADATA]).encode("utf-8", "replace")))
+    with _exr_parts(path) as parts:
+        tensors = {part.name(): _tensor(_planes(part)) for part in parts}
+        metadata = dict(parse_json("metadata", str(parts[0].header[METADATA]).encode("utf-8", "replace")))
         # OpenEXR prints a message and omits the parts that it cannot read.
         if list(metadata["parts"]) != list(tensors):
             raise ValueError("parts of it cannot be read")
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise _damaged(path, error) from None
     return tensors, metadata
 
 
 def load_exr_channel(path: Path) -> np.ndarray:
     """Read the only channel (H, W) of an OpenEXR file as float32; FormatError if it has more, or is damaged."""
-    planes = [plane for _, _, channels in _parts(path) for plane in channels.values()]
+    with _exr_parts(path) as parts:
+        planes = [plane for part in parts for plane in _planes(part).values()]
     if len(planes) != 1:
         raise FormatError(f"{path}: expected one channel, got {len(planes)}")
     return np.asarray(planes[0], np.float32)
@@ -159,8 +153,9 @@ def load_exr_channel(path: Path) -> np.ndarray:
 def load_exr_colors(path: Path) -> np.ndarray:
     """Read the channels R, G, B of an OpenEXR file's first part as (H, W, 3) float32; FormatError without them."""
     planes: dict[str, np.ndarray] = {}
-    for _, _, channels in reversed(_parts(path)):  # of a name that parts share, the first
-        planes |= channels
+    with _exr_parts(path) as parts:
+        for part in reversed(parts):  # of a name that parts share, the first
+            planes |= _planes(part)
     if not planes.keys() >= {*"RGB"}:
         raise FormatError(f"{path}: expected the channels R, G and B, got {', '.join(planes)}")
     colors = np.stack([np.asarray(planes[name], np.float32) for name in "RGB"], axis=-1)
@@ -169,23 +164,24 @@ def load_exr_colors(path: Path) -> np.ndarray:
     return colors
 
 
-def _parts(path: Path) -> list[tuple[str, dict[str, Any], dict[str, np.ndarray]]]:
-    """Read the name, the header, and the channels (H, W) by name of each part of an OpenEXR file."""
+@contextmanager
+def _exr_parts(path: Path, header_only: bool = False) -> Iterator[list[Any]]:
+    """Yield the parts of an OpenEXR file; FormatError for what OpenEXR or the block raises of a damaged one."""
     import OpenEXR
 
-    exr_size(path)
+    if not header_only:
+        exr_size(path)  # which refuses what would not fit in memory
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            return [
-                (part.name(), dict(part.header), {name: channel.pixels for name, channel in part.channels.items()})
-                for part in file.parts
-            ]
+        with OpenEXR.File(str(path), separate_channels=True, header_only=header_only) as file:
+            yield file.parts
     except Exception as error:  # OpenEXR raises RuntimeError and other types
-        raise _damaged(path, error) from None
+        whole = f"expected a whole OpenEXR file, but it cannot be read ({one_line(error)})"
+        raise FormatError(f"{path}: {whole}") from None
 
 
-def _damaged(path: Path, error: Exception) -> FormatError:
-    return FormatError(f"{path}: expected a whole OpenEXR file, but it cannot be read ({one_line(error)})")
+def _planes(part: Any) -> dict[str, np.ndarray]:
+    """Return the channels (H, W) of a part of an OpenEXR file by name."""
+    return {name: channel.pixels for name, channel in part.channels.items()}
 
 
 def load_deep(path: Path) -> np.ndarray:
@@ -230,24 +226,19 @@ def exr_size(path: Path) -> tuple[int, int]:
 
     FormatError: the file is damaged, or its headers announce more than it can hold.
     """
-    import OpenEXR
-
     total, sizes = 0, []
-    try:
-        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
-            for part in file.parts:
-                low, high = part.header["dataWindow"]
-                width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
-                if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-                    raise ValueError(f"expected 1 to {MAX_SIDE} pixels a side, got {width}x{height}")
-                sizes.append((width, height))
-                total += width * height * 4 * len(part.header["channels"])
+    with _exr_parts(path, header_only=True) as parts:
+        for part in parts:
+            low, high = part.header["dataWindow"]
+            width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
+            if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
+                raise ValueError(f"expected 1 to {MAX_SIDE} pixels a side, got {width}x{height}")
+            sizes.append((width, height))
+            total += width * height * 4 * len(part.header["channels"])
         limit = MAX_RATIO * path.stat().st_size
         if total > limit:
             raise ValueError(f"expected at most {limit:,} bytes of pixels from a file of this size, got {total:,}")
         return sizes[0]
-    except Exception as error:  # OpenEXR raises RuntimeError and other types
-        raise _damaged(path, error) from None
 
 
 def error_map(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
