@@ -15,7 +15,6 @@ from nexwarp.kernels.fused_texture import (
     FORWARD_BLOCKS,
     FORWARD_THREADS,
     fused_kernels,
-    half_scale,
     order_gradients,
     pack_matrices,
 )
@@ -30,7 +29,7 @@ from nexwarp.native.fused_texture import (
     logical_output,
 )
 from nexwarp.ops._interop import Argument, Context, first_derivative, graph_is_kept, launch
-from nexwarp.ops.neural_field import HALF_GRADIENT, Field, Points, Rays
+from nexwarp.ops.neural_field import Field, Points, Rays, gradient_scales
 
 GROUP_BYTES = 2**24  # of sums that a launch of the backward lookup adds to: a third of an H100's L2 cache
 
@@ -81,32 +80,28 @@ def colors(points: Points, field: Field, rays: Rays, *, keep: bool) -> torch.Ten
     return _Colors.apply(points, field, rays, keep, points.positions, points.depths, field.grid, *field.weights)
 
 
-class _Context(Context):
-    rays: Rays
-
-
 class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: _Context, points: Points, field: Field, rays: Rays, keep: bool, *tensors: torch.Tensor
+        ctx: Context, points: Points, field: Field, rays: Rays, keep: bool, *tensors: torch.Tensor
     ) -> torch.Tensor:
         result, kept = forward(points, field, rays, keep)
         if keep:
-            ctx.rays = replace(rays, directions=rays.directions[:0])
+            ctx.rest = replace(rays, directions=rays.directions[:0])
             fixed = (rays.directions, points.focal, field.stored(), field.resolutions)
             ctx.save_for_backward(points.positions, points.depths, *fixed, *kept, *field.weights)
         return result
 
     @staticmethod
     @first_derivative
-    def backward(ctx: _Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         positions, depths, directions, focal, table, resolutions, encoded, packed, result, *weights = ctx.saved_tensors
         need_positions, need_depths, need_grid = ctx.needs_input_grad[4:7]
         points, field = Points(positions, depths, focal), Field(table, weights, resolutions, True, table)
         kept, grad = Kept(encoded, packed, result), grad.contiguous()
-        scale, unscale = _scales(grad)
+        scale, unscale = gradient_scales(grad, table.dtype)
         grad_encoded = torch.empty_like(encoded) if graph_is_kept() else encoded  # else gradients overwrite features
-        fused, units = _fused(points, field, replace(ctx.rays, directions=directions), kept)
+        fused, units = _fused(points, field, replace(ctx.rest, directions=directions), kept)
         fused |= {"scale": scale, "unscale": unscale, "grad_colors": grad, "grad_encoded": grad_encoded}
         grad_matrices = _mlp_backward(fused, weights, table, unscale)
         grad_grid, grad_points = _scatter(fused, points, table, units, need_positions or need_depths)
@@ -201,14 +196,6 @@ def _pack(weights: Sequence[torch.Tensor], features: int) -> torch.Tensor:
     packed = torch.empty(len(sources), dtype=torch.float16, device=sources.device)
     launch(packed, pack_matrices, len(packed), [*weights, sources], [packed])
     return packed.view(torch.int32)
-
-
-def _scales(grad: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the factor (1,) that gradients in half precision are multiplied by, and its inverse."""
-    largest = torch.linalg.vector_norm(grad, float("inf")).view(1)
-    scale, unscale = torch.empty_like(largest), torch.empty_like(largest)
-    launch(grad, half_scale, 1, [largest, HALF_GRADIENT], [scale, unscale])
-    return scale, unscale
 
 
 @functools.cache

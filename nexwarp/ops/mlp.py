@@ -32,7 +32,9 @@ def padded(count: int, dtype: torch.dtype) -> int:
 
 
 def outputs(encoded: torch.Tensor, matrices: Sequence[torch.Tensor], keep: bool) -> list[torch.Tensor]:
-    """Return the input (in, n) of each layer if `keep`, and the output of the last one."""
+    """Return the input (in, n) of each layer if `keep`, and the output of the last one; `encoded` without layers."""
+    if not matrices:
+        return [encoded]
     if encoded.device.type != "cpu":
         layers = [encoded]
         for matrix in matrices[:-1]:
@@ -63,6 +65,8 @@ def outputs_backward(
     signal: torch.Tensor, layers: Sequence[torch.Tensor], matrices: Sequence[torch.Tensor]
 ) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Return the gradients of the first layer's input and of the matrices, from that of the output (out, n)."""
+    if not matrices:
+        return signal, []
     if signal.device.type != "cpu":
         grads: list[torch.Tensor] = []
         for matrix, layer in zip(reversed(matrices), reversed(layers), strict=True):

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 
 import torch
 
+from nexwarp.kernels.fused_texture import half_scale
+from nexwarp.ops._interop import launch
+
 # Gradients in half precision are scaled, by a power of two, so that the largest incoming one is near this.
 HALF_GRADIENT = 64.0
 
@@ -30,7 +33,7 @@ class Field:
     """
 
     grid: torch.Tensor  # (L, T, F) features, T a power of two, F in 1, 2, 4, 8
-    weights: Sequence[torch.Tensor]  # 3 (d + 1)^2 outputs for SH degree d
+    weights: Sequence[torch.Tensor]  # 3 (d + 1)^2 outputs for SH degree d; without any, outputs are the features
     resolutions: torch.Tensor  # (L,) cells per world unit; not differentiated
     half: bool = False
     table: torch.Tensor | None = None  # (L, T, F) the grid in half precision, where the caller has it already
@@ -56,9 +59,14 @@ class Rays:
     image: tuple[int, int] | None = None
 
 
-def gradient_scale(grad: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
-    """(1,) power of two that brings the largest gradient near HALF_GRADIENT in half precision; 1 otherwise."""
+def gradient_scales(grad: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the factor (1,) that gradients of a dtype are multiplied by on the way, and its inverse; 1 but for half.
+
+    It is the power of two that brings the largest gradient near HALF_GRADIENT.
+    """
     if dtype != torch.float16 or grad.numel() == 0:
-        return grad.new_ones(1)
-    largest = torch.linalg.vector_norm(grad, float("inf")).clamp_min(1e-30)
-    return torch.exp2(torch.floor(torch.log2(HALF_GRADIENT / largest))).clamp(2.0**-24, 2.0**60).view(1)
+        return grad.new_ones(1), grad.new_ones(1)
+    largest = torch.linalg.vector_norm(grad, float("inf")).view(1)
+    scale, unscale = torch.empty_like(largest), torch.empty_like(largest)
+    launch(grad, half_scale, 1, [largest, HALF_GRADIENT], [scale, unscale])
+    return scale, unscale

@@ -24,10 +24,10 @@ from nexwarp.kernels.mlp import POINTS, THREADS, layer_kernel
 from nexwarp.kernels.types import types
 from nexwarp.ops._interop import Context
 from nexwarp.ops.collect import Walked
-from nexwarp.ops.neural_field import Points, Rays
+from nexwarp.ops.neural_field import Field, Points, Rays
 from nexwarp.ops.project import Pinhole, Projection
 from nexwarp.ops.surface import walk_surface
-from nexwarp.ops.texture import Lookup, colors_backward, write_colors
+from nexwarp.ops.texture import colors_backward, write_colors
 from nexwarp.ops.tiles import Tiles
 
 
@@ -213,22 +213,6 @@ def unproject(tape: wp.Tape, depths: wp.array, viewmat: wp.array, image: Image) 
     return positions, directions
 
 
-class _Encode(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Context, *inputs: torch.Tensor) -> torch.Tensor:
-        table, positions, depths, resolutions, focal = inputs
-        ctx.save_for_backward(*inputs)
-        return Lookup(Points(positions, depths, focal), table, resolutions).features()[:, : len(depths)]
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        table, positions, depths, resolutions, focal = ctx.saved_tensors
-        lookup = Lookup(Points(positions, depths, focal), table, resolutions)
-        grad_table, grad_points = lookup.backward(grad.contiguous(), grad.new_ones(1), True)
-        return grad_table, grad_points[:, :3], grad_points[:, 3], None, None
-
-
 def hashgrid(
     tape: wp.Tape, table: wp.array, positions: wp.array, depths: wp.array, resolutions: wp.array, image: Image
 ) -> wp.array:
@@ -241,8 +225,8 @@ def hashgrid(
     def op(
         table: torch.Tensor, positions: torch.Tensor, depths: torch.Tensor, resolutions: torch.Tensor
     ) -> list[torch.Tensor]:
-        focal = depths.new_tensor([(fx * fy) ** 0.5])
-        return [_Encode.apply(table, positions.flatten(0, 1), depths.flatten(), resolutions, focal)]
+        points = Points(positions.flatten(0, 1), depths.flatten(), depths.new_tensor([(fx * fy) ** 0.5]))
+        return [ops.texture(points, Field(table, [], resolutions))]
 
     return _record(tape, op, [table, positions, depths, resolutions], [depths.dtype])[0]
 

@@ -20,7 +20,7 @@ from nexwarp.ops._interop import (
     launch,
     sums_in_fixed_point,
 )
-from nexwarp.ops.neural_field import Field, Points, Rays, gradient_scale
+from nexwarp.ops.neural_field import Field, Points, Rays, gradient_scales
 
 # Runs of levels that CPU threads share out in the backward pass.
 RUNS = 8
@@ -95,8 +95,8 @@ class _Texture(torch.autograd.Function):
         rays, count = ctx.rest
         layers, matrices = rest[:count], rest[count:]
         need_positions, need_depths, need_directions, need_grid = ctx.needs_input_grad[4:8]
-        scale = gradient_scale(grad, table.dtype)
-        signal = coefficients.new_empty(len(coefficients), layers[0].shape[1])
+        scale, unscale = gradient_scales(grad, table.dtype)
+        signal = coefficients.new_empty(len(coefficients), mlp.padded(len(positions), table.dtype))
         signal[:, len(positions) :] = 0
         grad_directions = None
         if rays is None:
@@ -104,7 +104,6 @@ class _Texture(torch.autograd.Function):
         else:
             rays = replace(rays, directions=directions)
             grad_directions = colors_backward(signal, coefficients, rays, grad.contiguous(), scale, need_directions)
-        unscale = scale.reciprocal()
         with torch.autocast(grad.device.type, enabled=False):
             signal, grad_matrices = mlp.outputs_backward(signal, layers, matrices)
         lookup = Lookup(Points(positions, depths, focal), table, resolutions)
