@@ -8,7 +8,8 @@ import torch
 import nexwarp as nw
 from nexwarp import ops
 from nexwarp.model.exposures import Exposures
-from nexwarp.model.render import draw as draw_parts
+from nexwarp.model.render import Frame
+from nexwarp.model.render import draw as draw_frame
 from tests.narrowing import present, total
 from tests.reference import collect
 from tests.reference import render as reference
@@ -28,7 +29,8 @@ def draw(
     surfels, camera, options = make_surfels(scene), make_camera(scene), {"background": BACKGROUND} | options
     if jitter is None:
         return nw.render(surfels, texture, camera, **options)
-    return draw_parts(surfels, texture, camera, nw.RenderOptions(**options), jitter=jitter)
+    whole = nw.RenderOptions(**options)
+    return draw_frame(Frame(surfels, texture, camera, whole, whole.background, jitter=jitter))
 
 
 def assert_same(actual: Any, expected: Any, buffers: tuple[str, ...] = BUFFERS) -> None:

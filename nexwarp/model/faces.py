@@ -1,7 +1,8 @@
 """Panoramas, fisheye lenses and other rays from one point: resampled from pinhole pictures, the faces of a cube."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -10,11 +11,8 @@ import torch
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.ray_camera import RayCamera
-from nexwarp.model.exposures import Exposures
-from nexwarp.model.options import RenderOptions
-from nexwarp.model.render import Rendering, draw
-from nexwarp.model.surfels import Surfels
-from nexwarp.model.texture import Texture
+from nexwarp.model.options import color_tensor
+from nexwarp.model.render import Frame, Rendering, draw
 
 FINER = 2.0  # resolution of a face's middle over that of the ray camera
 MOST_FINER = 4096  # pixels along a face's side that FINER asks for, at most
@@ -108,30 +106,25 @@ class FaceBuffers:
 
 
 @torch.no_grad()
-def draw_faces(
-    surfels: Surfels,
-    texture: Texture | None,
-    camera: RayCamera,
-    options: RenderOptions,
-    background: torch.Tensor,
-    exposures: Exposures | None = None,
-    **rest: Any,
-) -> RayRendering:
-    """As `draw`, from a camera of rays: blended by distance, so that faces agree where they meet."""
-    options = options.changed(order="distance")
+def draw_faces(camera: RayCamera, frame_of: Callable[[Camera], Frame]) -> RayRendering:
+    """As `draw`, from a camera of rays: blended by distance, so that faces agree where they meet.
+
+    `frame_of` returns what the picture of a face is drawn from.
+    """
     rays = camera.rays.reshape(-1, 3).to(camera.viewmat)
     facings = torch.tensor(FACING).to(rays)
     lengths, faces = (rays @ facings[:, 2].T).max(dim=1)  # along the axis that a ray is closest to
     looks = []
     for index in faces[lengths > 0].unique().tolist() or [0]:
         face, pixels = Face(camera, facings[index]), ((faces == index) & (lengths > 0)).nonzero()[:, 0]
-        turned = rays[pixels] @ facings[index].T
+        frame, turned = frame_of(face), rays[pixels] @ facings[index].T
         places = turned[:, :2] / turned[:, 2:] * (face.fx / (face.width / 2))
-        rendering = draw(surfels, texture, face, options, background=background, **rest)
-        looks.append(Look(rendering, pixels, places))
+        options = frame.options.changed(order="distance")
+        looks.append(Look(draw(replace(frame, options=options, exposures=None)), pixels, places))
     buffers = FaceBuffers(lengths.view(camera.height, camera.width), looks)
-    gains = exposures if options.exposure == "photos" else None
+    gains = frame.exposures if options.exposure == "photos" else None
     factors = 1.0 if gains is None else gains.factors(camera)
+    background = color_tensor(frame.background, frame.surfels.means)
     image = buffers.values("image", "bilinear", background) * factors
     plain, textured = (buffers.values(name, "bilinear") * factors for name in ("plain", "textured"))
     ids, weights = buffers.values("ids", "nearest", -1), buffers.values("weights", "nearest")

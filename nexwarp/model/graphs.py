@@ -23,14 +23,13 @@ import torch
 from torch import nn
 
 from nexwarp import ops
-from nexwarp.cameras.camera import Camera, StagedCamera
+from nexwarp.cameras.camera import StagedCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.machine import needed_memory
-from nexwarp.model.exposures import Exposures
-from nexwarp.model.options import Color, RenderOptions, color_numbers
-from nexwarp.model.render import Rendering, draw
+from nexwarp.model.options import color_numbers
+from nexwarp.model.render import Frame, Rendering, draw
 from nexwarp.model.surfels import Surfels
-from nexwarp.model.texture import DetailLimits, NeuralTexture, Texture
+from nexwarp.model.texture import NeuralTexture
 
 log = logging.getLogger(__name__)
 
@@ -81,23 +80,8 @@ def capturing(device: torch.device) -> bool:
 # Frames
 
 
-@dataclasses.dataclass(frozen=True)
-class Frame:
-    """What a frame renders: the arguments of `draw`."""
-
-    surfels: Surfels
-    texture: Texture | None
-    exposures: Exposures | None
-    limits: DetailLimits | None
-    camera: Camera
-    options: RenderOptions
-    background: Color
-
-    @property
-    def draw(self) -> Callable[..., Rendering]:
-        """`draw` for any camera and background."""
-        parts = functools.partial(draw, self.surfels, self.texture, exposures=self.exposures, limits=self.limits)
-        return functools.partial(parts, options=self.options)
+class GraphFrame(Frame):
+    """A frame that a graph may draw."""
 
     @functools.cached_property
     def tensors(self) -> list[torch.Tensor]:
@@ -138,20 +122,21 @@ def _tensors_of(module: nn.Module) -> list[torch.Tensor]:
     return tensors
 
 
-def render(frame: Frame, *, whole: bool = True) -> Rendering:
+def render(frame: GraphFrame, *, whole: bool = True) -> Rendering:
     """Render by a graph where there can be one; not `whole` keeps the image alone, which takes less memory."""
     device = frame.surfels.device
     if (graphs := _graphs_for(frame)) is not None and (rendering := graphs.render(frame, whole)) is not None:
         return rendering
-    camera = frame.camera if frame.camera.device == device else frame.camera.to(device)
+    if frame.camera.device != device:
+        frame = dataclasses.replace(frame, camera=frame.camera.to(device))
     try:
-        return frame.draw(camera, background=frame.background)
+        return draw(frame)
     except OutOfMemoryError:
         # In the middle of another capture, freeing would break it; whoever captures frees afterwards.
         if capturing(device) or not release_graphs():
             raise
     # Outside of the handler: the error's traceback would keep alive what has been allocated.
-    return frame.draw(camera, background=frame.background)
+    return draw(frame)
 
 
 class FrameGraphs:
@@ -176,7 +161,7 @@ class FrameGraphs:
         # The last rendering, whose buffers any graph may overwrite.
         self.latest: weakref.ref[CapturedRendering] | None = None
 
-    def render(self, frame: Frame, whole: bool) -> "CapturedRendering | None":
+    def render(self, frame: GraphFrame, whole: bool) -> "CapturedRendering | None":
         """Render by a graph; None if the frame is to be launched kernel by kernel."""
         with self.lock:
             captured = self._find(frame, whole)
@@ -196,7 +181,7 @@ class FrameGraphs:
             self.latest = weakref.ref(rendering) if whole else None
             return rendering
 
-    def _find(self, frame: Frame, whole: bool) -> "CapturedFrame | None":
+    def _find(self, frame: GraphFrame, whole: bool) -> "CapturedFrame | None":
         """Return the frame's graph, captured first where needed; None if the frame is to be launched."""
         state, common = frame.state, frame.kind()
         for kind in ((True, *common), (whole, *common)):  # one that keeps all buffers has the image, too
@@ -214,7 +199,7 @@ class FrameGraphs:
             self.frames.popitem(last=False)
         return self._capture(frame, kind)
 
-    def _capture(self, frame: Frame, kind: tuple[Hashable, ...]) -> "CapturedFrame | None":
+    def _capture(self, frame: GraphFrame, kind: tuple[Hashable, ...]) -> "CapturedFrame | None":
         """Capture a frame; return None if that is not possible."""
         if not self.frames:
             self.pool = None  # it has gone with its last graph
@@ -261,7 +246,7 @@ class CapturedFrame:
 
     @torch.inference_mode(False)  # later frames write to its tensors in any mode
     @torch.no_grad()
-    def __init__(self, graphs: FrameGraphs, frame: Frame, kind: tuple[Hashable, ...]) -> None:
+    def __init__(self, graphs: FrameGraphs, frame: GraphFrame, kind: tuple[Hashable, ...]) -> None:
         self.graphs, self.state, self.kind = graphs, frame.state, kind
         device = graphs.stream.device
         exposures = frame.exposures if frame.options.exposure == "photos" else None
@@ -272,14 +257,14 @@ class CapturedFrame:
         if graphs.pool is None:
             graphs.pool = torch.cuda.graph_pool_handle()
         with graphs.using():
-            work = functools.partial(frame.draw, self.camera, background=self.camera.color)
+            work = functools.partial(draw, dataclasses.replace(frame, camera=self.camera, background=self.camera.color))
             captured = Captured(work, graphs.stream, graphs.pool)
         self.graph, result = captured.graph, captured.result
         self.image, self.room = result.image, result.intermediates.tiles.room
         # Memory of what is not kept here serves other graphs.
         self.result = result if kind[0] else None
 
-    def take(self, frame: Frame) -> None:
+    def take(self, frame: GraphFrame) -> None:
         """Overwrite what the graph reads with another camera and background."""
         camera, background = frame.camera, frame.background
         if isinstance(background, torch.Tensor):
@@ -377,7 +362,7 @@ def release_graphs() -> bool:
     return any([graphs.clear() for graphs in everything])
 
 
-def _graphs_for(frame: Frame) -> FrameGraphs | None:
+def _graphs_for(frame: GraphFrame) -> FrameGraphs | None:
     """Return the graphs of the frame's model; None if the frame cannot be captured."""
     surfels, device = frame.surfels, frame.surfels.device
     if not _enabled or device.type != "cuda" or not _can_capture(device, frame):
@@ -389,7 +374,7 @@ def _graphs_for(frame: Frame) -> FrameGraphs | None:
     return graphs
 
 
-def _can_capture(device: torch.device, frame: Frame) -> bool:
+def _can_capture(device: torch.device, frame: GraphFrame) -> bool:
     """Whether a frame fits the tensors that a graph reads, needs no gradients and is none of a larger graph."""
     camera, read = frame.camera, [*frame.tensors]
     if isinstance(frame.background, torch.Tensor):

@@ -16,7 +16,7 @@ from nexwarp.io.json_files import Json
 from nexwarp.model import graphs
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.faces import draw_faces
-from nexwarp.model.options import Color, RenderChanges, RenderOptions, color_tensor
+from nexwarp.model.options import Color, RenderChanges, RenderOptions
 from nexwarp.model.render import Rendering
 from nexwarp.model.surfels import Surfels
 from nexwarp.model.texture import DetailLimits, Texture
@@ -126,7 +126,7 @@ class Model(nn.Module):
         if not isinstance(camera, (Camera, RayCamera)):
             raise TypeError(f"camera: expected a nexwarp.Camera or a sequence of them, got {type(camera).__name__}")
         if isinstance(camera, RayCamera):
-            return self._faces(camera, background, changes)
+            return draw_faces(camera.to(self.device), lambda face: self._frame(face, background, changes))
         return graphs.render(self._frame(camera, background, changes))
 
     def render_image(
@@ -152,19 +152,13 @@ class Model(nn.Module):
         with torch.no_grad():
             return graphs.render(self._frame(camera, background, changes), whole=False).image
 
-    def _faces(self, camera: RayCamera, background: Color | None, changes: RenderChanges) -> Rendering:
-        options = self.options.changed(**changes)
-        color = color_tensor(options.background if background is None else background, self.surfels.means)
-        parts = self.surfels, self.texture if options.max_hits else None, camera.to(self.device)
-        return draw_faces(*parts, options, color, self.exposures, limits=self.detail_limits)
-
-    def _frame(self, camera: Camera, background: Color | None, changes: RenderChanges) -> graphs.Frame:
+    def _frame(self, camera: Camera, background: Color | None, changes: RenderChanges) -> graphs.GraphFrame:
         options = self.options.changed(**changes)
         texture = self.texture if options.max_hits else None
         color = options.background if background is None else background
         if camera.origin not in (None, self.origin) and self.origin is not None:
             camera = camera.moved(self.origin).to(self.surfels.means.dtype)
-        return graphs.Frame(self.surfels, texture, self.exposures, self.detail_limits, camera, options, color)
+        return graphs.GraphFrame(self.surfels, texture, camera, options, color, self.exposures, self.detail_limits)
 
     def bare(self, **changes: Unpack[RenderChanges]) -> "Model":
         """Return a model with the same surfels, but without texture, exposures and detail limits.

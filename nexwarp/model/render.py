@@ -165,32 +165,37 @@ def render(
     if background is None:
         raise TypeError("background: expected numbers or a tensor, got None")
     options = RenderOptions(max_hits, sh_degree=sh_degree, clamp_texture=clamp_texture, order=order)
-    return draw(surfels, texture, camera, options, background=background)
+    return draw(Frame(surfels, texture, camera, options, background))
 
 
-def draw(
-    surfels: Surfels,
-    texture: Texture | None,
-    camera: Camera,
-    options: RenderOptions,
-    *,
-    background: Color | None = None,
-    exposures: Exposures | None = None,
-    limits: DetailLimits | None = None,
-    jitter: torch.Tensor | None = None,
-) -> Rendering:
-    """Draw surfels from a camera: the one path from the parts of a model to pixels.
+@dataclass(frozen=True)
+class Frame:
+    """The parts of a model, or of a training, that one picture is drawn from; see `render`.
 
-    As `render`. A background of None is that of the options. `jitter`: (H, W, K) factors on the depths at which the
-    texture is evaluated, see `jitter_factors`; for training.
+    Exposures and limits count as the options say. `jitter` are (H, W, K) factors on the depths at which the texture is
+    evaluated, see `jitter_factors`; for training.
     """
+
+    surfels: Surfels
+    texture: Texture | None
+    camera: Camera
+    options: RenderOptions
+    background: Color
+    exposures: Exposures | None = None
+    limits: DetailLimits | None = None
+    jitter: torch.Tensor | None = None
+
+
+def draw(frame: Frame) -> Rendering:
+    """Draw a frame: the one path from the parts of a model to pixels."""
+    surfels, texture, camera, options = frame.surfels, frame.texture, frame.camera, frame.options
     prepare_device("surfels", surfels.means)
-    exposures = exposures if options.exposure == "photos" else None
-    limits = limits if options.detail_limits and len(surfels) else None
+    exposures = frame.exposures if options.exposure == "photos" else None
+    limits = frame.limits if options.detail_limits and len(surfels) else None
     try:
         with torch.autocast(surfels.device.type, enabled=False):
-            color = color_tensor(options.background if background is None else background, surfels.means)
-            _check(surfels, texture, camera, options, color, limits, jitter)
+            color = color_tensor(frame.background, surfels.means)
+            _check(frame, color, limits)
             shape = antialiased(surfels.activated(), camera, limits)
             harmonics = surfels.sh0, surfels.shN
             colors = ops.plain_colors(harmonics, shape.means, camera.position, options.sh_degree)
@@ -198,7 +203,7 @@ def draw(
             pinhole = pinhole_of(camera, shape.means)
             tiles = ops.intersect_tiles(shape, projection, camera.viewmat, pinhole, blending=options.order)
             hits = ops.collect(projection, tiles, pinhole, max_hits=options.max_hits)
-            texels = None if texture is None else _texels(texture, camera, hits, options, limits, jitter)
+            texels = None if texture is None else _texels(frame, texture, hits, limits)
             residual = texture is not None and texture.residual
             slots = (hits.plain.new_empty(*hits.alpha.shape, 0, 3), hits.weights[..., :0])  # none are textured
             textured_slots = slots if texels is None else (texels, hits.weights)
@@ -234,16 +239,9 @@ def prepare_device(name: str, means: torch.Tensor) -> None:
         raise ValueError(f"{name}: expected values on a CPU or a CUDA device, got {device}")
 
 
-def _check(
-    surfels: Surfels,
-    texture: Texture | None,
-    camera: Camera,
-    options: RenderOptions,
-    background: torch.Tensor,
-    limits: DetailLimits | None,
-    jitter: torch.Tensor | None,
-) -> None:
+def _check(frame: Frame, background: torch.Tensor, limits: DetailLimits | None) -> None:
     """Check shapes, dtypes, devices and the memory of the image; checking values would wait for the GPU."""
+    surfels, texture, camera, options = frame.surfels, frame.texture, frame.camera, frame.options
     dtype, device = surfels.means.dtype, surfels.device
     if options.clamp_texture and texture is not None and texture.residual:
         raise ValueError("clamp_texture: expected False with a residual texture, got True")
@@ -251,8 +249,8 @@ def _check(
     expected: dict[str, tuple[torch.Tensor, tuple[int, ...]]] = {"background": (background, (3,))}
     if isinstance(texture, NeuralTexture):
         expected["texture.grid"] = (texture.grid, tuple(texture.grid.shape))
-    if jitter is not None:
-        expected["jitter"] = (jitter, (camera.height, camera.width, options.max_hits))
+    if frame.jitter is not None:
+        expected["jitter"] = (frame.jitter, (camera.height, camera.width, options.max_hits))
     if limits is not None:
         expected["detail_limits.nearest"] = (limits.nearest, (len(surfels),))
         expected["detail_limits.farthest"] = (limits.farthest, (len(surfels),))
@@ -285,17 +283,11 @@ def pinhole_of(camera: Camera, like: torch.Tensor) -> ops.Pinhole:
     return ops.Pinhole(camera.K.to(like), camera.width, camera.height, camera.near)
 
 
-def _texels(
-    texture: Texture,
-    camera: Camera,
-    hits: ops.Hits,
-    options: RenderOptions,
-    limits: DetailLimits | None,
-    jitter: torch.Tensor | None,
-) -> torch.Tensor:
+def _texels(frame: Frame, texture: Texture, hits: ops.Hits, limits: DetailLimits | None) -> torch.Tensor:
     """Return the textured colours (H, W, K, 3) of the hits."""
+    camera, options = frame.camera, frame.options
     pinhole = pinhole_of(camera, hits.depths)
-    positions, directions = ops.unproject(hits.depths, camera.viewmat, pinhole, jitter)
+    positions, directions = ops.unproject(hits.depths, camera.viewmat, pinhole, frame.jitter)
     found = Hits(hits.ids, hits.depths, hits.weights, hits.plain, hits.alpha, positions, directions)
     if not isinstance(texture, NeuralTexture):
         colors = texture.colors(found, camera)

@@ -51,7 +51,7 @@ class Target:
         places: (M,) int64, row * W + column of the points whose depths are compared, ascending; None is no such loss.
         expected: (M,) z-depths of these points, world units; 0 stands for no point. None where `places` is None.
         depth: (H, W) z-depths of the photo's depth map, world units, 0 where there is none; None is no such loss.
-        depth_jitter: (H, W, K), the `jitter` of `nexwarp.model.render.draw`; None is none.
+        depth_jitter: (H, W, K), the `jitter` of `nexwarp.model.render.Frame`; None is none.
         view: (1,) int64, index of the training view; None where poses are not learned.
         normals: factor of the normal loss in this step.
     """

@@ -16,7 +16,7 @@ from nexwarp.io.files import one_line
 from nexwarp.machine import deterministic, needed_memory, seed_everything, torch_threads
 from nexwarp.model.graphs import Gradients, GraphKey, StepGraphs, StepResult, beside, updating
 from nexwarp.model.model import Model
-from nexwarp.model.render import draw
+from nexwarp.model.render import Frame, draw
 from nexwarp.train.checkpoint import Snapshot, load_checkpoint, save_checkpoint
 from nexwarp.train.exposure import Calibrate, calibrate_exposures
 from nexwarp.train.finish import FinishObserver, finish_model
@@ -148,8 +148,8 @@ class Trainer(TrainingState):
         """Render, compare, differentiate and update: the GPU's part of a step, which a CUDA graph can repeat."""
         try:
             target, options = refined(target, self.poses), self.render_options()
-            texture, background = self.texture if options.max_hits else None, target.background
-            out = draw(self.surfels, texture, target.camera, options, background=background, jitter=target.depth_jitter)
+            texture, jitter = self.texture if options.max_hits else None, target.depth_jitter
+            out = draw(Frame(self.surfels, texture, target.camera, options, target.background, jitter=jitter))
             taken = as_taken(out, target, plain=bool(self.own_losses))
             losses = step_losses(taken, target, self, self.own_losses)
             image, room, request = taken.image.detach(), out.intermediates.tiles.room, None

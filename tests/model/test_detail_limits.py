@@ -5,8 +5,7 @@ import torch
 
 import nexwarp as nw
 from nexwarp import ops
-from nexwarp.model.render import antialiased
-from nexwarp.model.render import draw as draw_parts
+from nexwarp.model.render import Frame, antialiased, draw
 from nexwarp.model.texture import NEVER, DetailLimits
 from nexwarp.train.finish import measure_detail_limits
 from tests.render_support import BACKGROUND, assert_same
@@ -32,7 +31,8 @@ def limits(surfels: nw.Surfels, nearest: float = 0.0, farthest: float = NEVER) -
 def limited(
     surfels: nw.Surfels, texture: nw.NeuralTexture | None, camera: nw.Camera, limits: Any, **changes: Any
 ) -> Any:
-    return draw_parts(surfels, texture, camera, nw.RenderOptions(**changes), limits=limits)
+    options = nw.RenderOptions(**changes)
+    return draw(Frame(surfels, texture, camera, options, options.background, limits=limits))
 
 
 def test_looks_beyond_those_of_training_have_their_detail(device: torch.device) -> None:

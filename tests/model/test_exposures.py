@@ -9,7 +9,7 @@ import torch
 import nexwarp as nw
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.buffers import render_buffers
-from nexwarp.model.render import draw
+from nexwarp.model.render import Frame, draw
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train import exposure as exposure_calibration
 from nexwarp.train.exposure import Observations, calibrate_exposures, choose_fit, fit_exposures, observations
@@ -221,7 +221,7 @@ def test_a_rendering_is_times_its_gains(device: torch.device, falloff):
     if falloff is not None:
         gains = gains * present(photos.falloff_of(camera))
         assert gains.shape == (*plain.alpha.shape, 3) and gains.min() < 0.8 * gains.max()
-    out = draw(surfels, texture, camera, options, exposures=photos)
+    out = draw(Frame(surfels, texture, camera, options, options.background, photos))
     for name in ("image", "plain", "textured"):
         assert_close(getattr(out, name), getattr(plain, name) * gains, kind="value", name=name)
     for name in ("alpha", "weights", "depths"):

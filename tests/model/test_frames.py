@@ -52,10 +52,7 @@ def test_a_staged_camera_renders_what_its_camera_does(device: torch.device) -> N
     for camera in others:
         staged.copy_(camera)
         present(staged.falloff).copy_(present(exposures.falloff_of(camera)))
-        found, expected = (
-            draw(model.surfels, model.texture, c, model.options, exposures=exposures, limits=model.detail_limits)
-            for c in (staged, camera)
-        )
+        found, expected = (draw(model._frame(c, None, {})) for c in (staged, camera))
         assert_same(found, expected, (*BUFFERS, "ids", "colors"))
 
 

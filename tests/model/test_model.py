@@ -16,7 +16,7 @@ from nexwarp.data.scene import SceneSource
 from nexwarp.io.pictures import to_uint8
 from nexwarp.model.buffers import load_buffers, render_buffers
 from nexwarp.model.options import Exposure, RenderChanges
-from nexwarp.model.render import draw
+from nexwarp.model.render import Frame, draw
 from nexwarp.run.folder import RunRecord, create_run
 from tests import render_support
 from tests.cli.support import picture
@@ -57,7 +57,7 @@ def full_model(device: torch.device | str = "cpu", falloff: tuple[float, float, 
 
 def pure(model: nw.Model, camera: nw.Camera, **parts: Any) -> nw.Rendering:
     """The rendering of a model's surfels and texture, with the given parts only."""
-    return draw(model.surfels, model.texture, camera, model.options, **parts)
+    return draw(Frame(model.surfels, model.texture, camera, model.options, model.options.background, **parts))
 
 
 @pytest.mark.parametrize("saved", ["photos", "mean"])
@@ -111,7 +111,8 @@ def test_changes_are_options_of_one_rendering(device: torch.device) -> None:
     model, camera = full_model(device), cameras_of(device)[0]
     before = model.options
     out = model.render(camera, max_hits=0, background=(1.0, 0.0, 0.0), sh_degree=0, exposure="mean")
-    expected = draw(model.surfels, None, camera, nw.RenderOptions(0, (1.0, 0.0, 0.0), 0), limits=model.detail_limits)
+    options = nw.RenderOptions(0, sh_degree=0)
+    expected = draw(Frame(model.surfels, None, camera, options, (1.0, 0.0, 0.0), limits=model.detail_limits))
     assert_same(out, expected)
     assert model.options is before
     red = model.render(camera, background=torch.tensor([1.0, 0.0, 0.0], device=device), exposure="mean").image
@@ -200,8 +201,8 @@ def test_gradients_are_those_of_the_pure_rendering(device: torch.device) -> None
         if through_model:
             out = model.render(camera, background=behind)
         else:
-            parts = {"exposures": model.exposures, "limits": model.detail_limits}
-            out = draw(model.surfels, model.texture, camera, OPTIONS, background=behind, **parts)  # type: ignore[arg-type]
+            parts = (model.exposures, model.detail_limits)
+            out = draw(Frame(model.surfels, model.texture, camera, OPTIONS, behind, *parts))
         leaves: dict[str, torch.Tensor] = {"viewmat": camera.viewmat, "background": behind, "grid": model.texture.grid}
         leaves |= dict(model.surfels.named_parameters())
         gradients = torch.autograd.grad(out.image.square().sum(), list(leaves.values()))

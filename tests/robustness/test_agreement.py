@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.model.render import draw, jitter_factors
+from nexwarp.model.render import Frame, draw, jitter_factors
 from tests.render_support import BACKGROUND, BUFFERS, assert_gradients, loss, reference_render, rigid_gradient, twin
 from tests.scenes import make_camera, make_surfels, make_texture, named_scene
 from tests.tolerances import FLIPS, assert_close, assert_same_ids
@@ -70,7 +70,7 @@ def test_render_agrees_with_the_reference(name, textured, max_hits, sh_degree, c
     if jitter is None:
         out = nw.render(surfels, texture, camera, **options)
     else:
-        out = draw(surfels, texture, camera, nw.RenderOptions(**options), jitter=jitter)
+        out = draw(Frame(surfels, texture, camera, nw.RenderOptions(**options), BACKGROUND, jitter=jitter))
         options["shares"] = jitter.cpu()
     expected = reference_render(surfels64, texture64, camera64, **options)
     loss(out).backward()
