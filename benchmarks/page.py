@@ -22,6 +22,8 @@ import torch
 import nexwarp as nw
 from nexwarp.cameras.camera import Camera
 from nexwarp.export.baked_scene import BakedScene
+from nexwarp.export.web.baked import encode_atlas, encode_harmonics
+from nexwarp.model.surfels import axes
 from nexwarp.run.evaluate import psnr
 
 SHADERS = Path(nw.__file__).parent / "export" / "web" / "page" / "baked_shaders.js"
@@ -35,34 +37,22 @@ def shaders() -> dict[str, str]:
     return {name: text.replace("${COMMON}", texts["COMMON"]) for name, text in texts.items()}
 
 
-def axes_of(quats: torch.Tensor) -> torch.Tensor:
-    """Return the axes (N, 3, 3), in columns, of unit quaternions wxyz (N, 4)."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
-
-
 def packed(scene: BakedScene) -> tuple[np.ndarray, np.ndarray, list[float]]:
     """Return geometry (rows, 128 * 8, 4) float32 and harmonics (rows, 128 * 15, 4) uint8 texels, and SH ranges."""
     assert scene.harmonics is not None and scene.limits is not None
-    shape, axes, (sh0, shN) = scene.shape, axes_of(scene.shape.quats), scene.harmonics
+    shape, (sh0, shN) = scene.shape, scene.harmonics
+    x, y, z = axes(torch.nn.functional.normalize(shape.quats, dim=1))
     count = len(sh0)
     zero = torch.zeros(count, 1)
-    parts = [axes[:, :, 0], shape.scales[:, :1], axes[:, :, 1], shape.scales[:, 1:], shape.means]
-    parts += [shape.opacities[:, None], shape.gammas, scene.limits.farthest[:, None].clamp(max=1e30), zero]
-    parts += [scene.boxes, scene.rects, sh0[:, 0], zero, axes[:, :, 2], zero]
+    parts = [x, shape.scales[:, :1], y, shape.scales[:, 1:], shape.means, shape.opacities[:, None]]
+    parts += [shape.gammas, scene.limits.farthest[:, None].clamp(max=1e30), zero]
+    parts += [scene.boxes, scene.rects, sh0[:, 0], zero, z, zero]
     rows = -(-count // PER_ROW)
     geometry = np.zeros((rows * PER_ROW, 32), np.float32)
     geometry[:count] = torch.cat(parts, dim=1).numpy()
-    bands = [shN[:, first:last] for first, last in ((0, 3), (3, 8), (8, 15))]
-    ranges = [max(band.abs().max().item(), 1e-12) if band.numel() else 1.0 for band in bands]
-    codes = [band.sign() * (band.abs() / most).sqrt() * 127 + 128 for band, most in zip(bands, ranges, strict=True)]
+    codes, ranges = encode_harmonics(shN)
     harmonics = np.full((rows * PER_ROW, 15, 4), 128, np.uint8)
-    harmonics[:count, : shN.shape[1], :3] = torch.cat(codes, dim=1).round().numpy()
+    harmonics[:count, : codes.shape[1], :3] = codes
     return geometry.reshape(rows, -1, 4), harmonics.reshape(rows, -1, 4), ranges
 
 
@@ -77,10 +67,8 @@ class PageDrawing:
         self.size, self.scene, texts = (width, height), scene, shaders()
         self.program = self.gl.program(texts["QUADS_VERTEX"], texts["QUADS_FRAGMENT"])
         geometry, harmonics, ranges = packed(scene)
-        texels = scene.texels[..., :3]
-        most = max(texels.abs().max().item(), 1e-6)
-        atlas = np.full((*texels.shape[:2], 4), 255, np.uint8)
-        atlas[..., :3] = (texels / most * 127 + 128).round().numpy()
+        texels, scale = encode_atlas(scene.texels[..., :3])
+        atlas = torch.nn.functional.pad(texels, (0, 1), value=255).numpy()
         nearest, linear = (moderngl.NEAREST, moderngl.NEAREST), (moderngl.LINEAR, moderngl.LINEAR)
         pictures = (
             ("geometry", geometry, "f4", nearest),
@@ -93,7 +81,7 @@ class PageDrawing:
             texture.use(unit)
             self.program[name].value = unit
         constants: dict[str, Any] = {"mode": 0, "coefficients": 1 + len(scene.harmonics[1][0])}  # type: ignore[index]
-        constants |= {"bands": tuple(ranges), "size": self.size, "atlasScale": (atlas.shape[1], atlas.shape[0], most)}
+        constants |= {"bands": tuple(ranges), "size": self.size, "atlasScale": (atlas.shape[1], atlas.shape[0], scale)}
         for name, value in constants.items():
             self.program[name].value = value
         self.ids = self.gl.buffer(reserve=4 * len(scene.boxes))
