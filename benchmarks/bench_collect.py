@@ -1,13 +1,13 @@
 """The collection stage and its parts, K = 2: plain colours and projection, tile lists, the walk along them."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
 
 import nexwarp as nw
-from benchmarks.scenes import SurfelScene, cloud, entries, geometry, outputs, random_like
+from benchmarks.scenes import SurfelScene, both_ways, entries, geometry, outputs, random_like, small_scene
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, ratio
 from nexwarp import ops
@@ -62,12 +62,8 @@ def collect(scene: SurfelScene, options: Options) -> list[Measurement]:
 def stage(scene: SurfelScene, options: Options) -> Measurement:
     """The whole stage, forward + backward."""
     g = geometry(scene)
-    signals = random_like(outputs(g.hits(MAX_HITS)))
-    return options.time(
-        "collection stage, forward + backward",
-        lambda: torch.autograd.grad(outputs(g.hits(MAX_HITS)), g.leaves, signals),
-        **scene.facts,
-    )
+    run = both_ways(lambda: outputs(g.hits(MAX_HITS)), g.leaves)
+    return options.time("collection stage, forward + backward", run, **scene.facts)
 
 
 def rasterize(scene: SurfelScene, options: Options) -> list[Measurement]:
@@ -77,23 +73,16 @@ def rasterize(scene: SurfelScene, options: Options) -> list[Measurement]:
 
     def trained(colors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         hits = replace(g, colors=colors).hits(MAX_HITS)
-        return (*outputs(hits), *ops.unproject(hits.depths, g.viewmat, g.pinhole))
+        return differentiable(*outputs(hits), *ops.unproject(hits.depths, g.viewmat, g.pinhole))
 
     def plain(colors: torch.Tensor) -> tuple[torch.Tensor, ...]:
         hits = nw.rasterize(*g.shape, colors, scene.camera, MAX_HITS)
-        return hits.plain, hits.depths, hits.weights, hits.alpha, hits.points, hits.directions
-
-    def both_ways(
-        run: Callable[[torch.Tensor], tuple[torch.Tensor, ...]], colors: torch.Tensor
-    ) -> Callable[[], object]:
-        leaves, results = (*g.shape, colors), differentiable(run(colors))
-        signals = random_like(results)
-        return lambda: torch.autograd.grad(differentiable(run(colors)), leaves, signals)
+        return differentiable(hits.plain, hits.depths, hits.weights, hits.alpha, hits.points, hits.directions)
 
     runs = {
-        "passes of a training step, forward + backward": both_ways(trained, g.colors),
-        "rasterize, 3 channels, forward + backward": both_ways(plain, g.colors),
-        "rasterize, 16 channels, forward + backward": both_ways(plain, wide),
+        "passes of a training step, forward + backward": both_ways(lambda: trained(g.colors), g.leaves),
+        "rasterize, 3 channels, forward + backward": both_ways(lambda: plain(g.colors), g.leaves),
+        "rasterize, 16 channels, forward + backward": both_ways(lambda: plain(wide), (*g.shape, wide)),
     }
     passes, three, sixteen = options.time_in_turns(runs, **scene.facts)
     return [
@@ -105,7 +94,7 @@ def rasterize(scene: SurfelScene, options: Options) -> list[Measurement]:
     ]
 
 
-def differentiable(results: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, ...]:
+def differentiable(*results: torch.Tensor) -> tuple[torch.Tensor, ...]:
     """Return those results that have a gradient."""
     return tuple(x for x in results if x.requires_grad)
 
@@ -122,7 +111,7 @@ def cpu(options: Options) -> list[Measurement]:
     """The collection stage on a CPU, forward + backward, with one thread and with two."""
     if options.cuda:
         return []
-    scene = cloud(500, 64, 48) if options.quick else cloud(20_000, 480, 320)
+    scene = small_scene(options)
     with threads(1):
         one = stage(scene, options)
     with threads(2):

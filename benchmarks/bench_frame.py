@@ -5,22 +5,17 @@ corners, and detail limits. Frames go round the scene's cameras, since a user's 
 """
 
 import itertools
-import time
-from collections.abc import Callable
 
 import torch
 
 import nexwarp as nw
-from benchmarks.gpu_time import gpu_time
-from benchmarks.scenes import SurfelScene, texture
+from benchmarks.scenes import SHIPPED, SurfelScene, texture
 from benchmarks.suite import Options
-from benchmarks.timing import Measurement, figure, synchronize
+from benchmarks.timing import Measurement, figure, mean_ms
 from nexwarp.model.exposures import Exposures
 from nexwarp.train.finish import measure_detail_limits
 
 STEADY_FRAMES = 50
-# The shape that `nexwarp train` gives a texture by default.
-SHIPPED = {"levels": 8, "features": 4, "residual": True}
 FALLOFF = (-0.2, -0.05)  # of the light towards the corners, as a and b of `Exposures`
 
 
@@ -32,18 +27,13 @@ def frame(scene: SurfelScene, options: Options) -> list[Measurement]:
     def render() -> torch.Tensor:
         return model.render(next(cameras)).image
 
-    return [
-        options.time("frame", render, **scene.facts),
-        *gpu_part(render, scene, options),
-        back_to_back(render, scene, options),
-    ]
-
-
-def gpu_part(render: Callable[[], torch.Tensor], scene: SurfelScene, options: Options) -> list[Measurement]:
-    """Return the time in which the GPU works for a frame; the rest of the frame's time is the host's."""
-    if not options.cuda:
-        return []
-    return [figure("frame, GPU's part", gpu_time(render, STEADY_FRAMES)[0], options.device, **scene.facts)]
+    measured = [options.time("frame", render, **scene.facts)]
+    if options.cuda:
+        measured.append(options.gpu_part("frame", render, STEADY_FRAMES, **scene.facts))
+    # Without a pause between frames, as in a video.
+    count = 3 if options.quick or not options.cuda else STEADY_FRAMES
+    elapsed = mean_ms(render, count, options.device)
+    return [*measured, figure(f"frame, of {count} back to back", elapsed, options.device, **scene.facts)]
 
 
 def finished(scene: SurfelScene) -> nw.Model:
@@ -62,15 +52,3 @@ def lens_of(scene: SurfelScene) -> Exposures:
     c = scene.camera
     corner = (c.width / 2 / c.fx) ** 2 + (c.height / 2 / c.fy) ** 2
     return Exposures.of(gains, scene.cameras, (*FALLOFF, corner)).to(scene.surfels.device)
-
-
-def back_to_back(render: Callable[[], torch.Tensor], scene: SurfelScene, options: Options) -> Measurement:
-    """Time frames without a pause between them, as in a video: wall time over their number."""
-    count = 3 if options.quick or not options.cuda else STEADY_FRAMES
-    synchronize(options.device)
-    start = time.perf_counter()
-    for _ in range(count):
-        render()
-    synchronize(options.device)
-    elapsed = 1e3 * (time.perf_counter() - start) / count
-    return figure(f"frame, of {count} back to back", elapsed, options.device, **scene.facts)

@@ -20,8 +20,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from benchmarks.gpu_time import gpu_time
-from benchmarks.scenes import Geometry, SurfelScene, entries, fox, garden, geometry, outputs, random_like
+from benchmarks.scenes import Geometry, SurfelScene, both_ways, entries, fox, geometry, large_scene, outputs
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement, figure, ratio
 from nexwarp.native.warp import TILE_SIZE
@@ -59,8 +58,7 @@ def run(options: Options) -> list[Measurement]:
     except ImportError as error:
         print(f"no peers: {error}", file=sys.stderr)
         return []
-    large = garden(20_000, 400, 259, options.data) if options.quick else garden(data=options.data)
-    scenes = [at_near(large, near) for near in NEARS]
+    scenes = [at_near(large_scene(options), near) for near in NEARS]
     if options.model is not None:
         scenes.append(at_near(fox(options.model, options.data), HEADLINE))
     return [m for scene in scenes for m in compare(scene.to(options.device), options, gsplat)]
@@ -110,16 +108,12 @@ def with_gamma_1(g: Geometry) -> Geometry:
 def timed(call: Call, scene: SurfelScene, options: Options) -> Iterator[Measurement]:
     """Time one side's whole calls and their GPU's part, and count its entries."""
     facts = scene.facts
-
-    def both() -> tuple[torch.Tensor, ...]:
-        return torch.autograd.grad(call.forward(), call.leaves, signals)
-
     with torch.no_grad():
-        signals = random_like(call.forward())
         yield options.time(f"{call.name}, forward", call.forward, **facts)
-        yield figure(f"{call.name}, forward, GPU's part", gpu_time(call.forward)[0], options.device, **facts)
+        yield options.gpu_part(f"{call.name}, forward", call.forward, **facts)
+    both = both_ways(call.forward, call.leaves)
     yield options.time(f"{call.name}, forward + backward", both, **facts)
-    yield figure(f"{call.name}, forward + backward, GPU's part", gpu_time(both)[0], options.device, **facts)
+    yield options.gpu_part(f"{call.name}, forward + backward", both, **facts)
     listed, walked = call.walked()
     yield figure(f"{call.name}, entries listed", listed / 1e6, options.device, unit="million", **facts)
     yield figure(f"{call.name}, entries walked", walked, options.device, unit="a pixel", **facts)

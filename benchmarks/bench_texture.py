@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 import nexwarp as nw
-from benchmarks.scenes import SAHAROV, SurfelScene, geometry, random_like, texture
+from benchmarks.scenes import SHIPPED, SurfelScene, both_ways, geometry, texture
 from benchmarks.suite import Options
 from benchmarks.timing import Measurement
 from nexwarp import ops
@@ -34,10 +34,9 @@ def texturing(scene: SurfelScene, options: Options, max_hits: int = 2) -> list[M
     facts["sizes"] |= {name: field.config[name] for name in ("levels", "features", "table_size", "max_resolution")}
     leaves = [positions, depths, *field.parameters()]
     with torch.no_grad():
-        (signal,) = random_like((colors(),))
         forward = options.time("texturing, forward", colors, **facts)
-    both = options.time("texturing, forward + backward", lambda: torch.autograd.grad(colors(), leaves, signal), **facts)
-    return [forward, both]
+    run = both_ways(lambda: (colors(),), leaves)
+    return [forward, options.time("texturing, forward + backward", run, **facts)]
 
 
 def trained_like(scene: SurfelScene) -> tuple[nw.NeuralTexture, nw.DetailLimits]:
@@ -52,7 +51,5 @@ def trained_like(scene: SurfelScene) -> tuple[nw.NeuralTexture, nw.DetailLimits]
         depths = camera.project(scene.surfels.means.detach())[1]
         sizes.append((camera.focal / depths[depths > camera.near]).cpu().numpy())
     finest = float(np.quantile(np.concatenate(sizes), 0.95))
-    shape = {"levels": 8, "features": 4, "residual": True, "min_resolution": finest / 32, "max_resolution": finest}
-    table = 2**20 if len(scene.surfels) >= SAHAROV else 2**15
-    field = texture(scene, table_size=table, **shape)
+    field = texture(scene, **SHIPPED, min_resolution=finest / 32, max_resolution=finest)
     return field, measure_detail_limits(nw.Model(scene.surfels, field), scene.cameras)

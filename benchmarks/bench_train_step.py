@@ -1,14 +1,14 @@
 """One default training step in the middle of a run: SH of degree 3, splat errors, all losses, Adam."""
 
-import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
 import nexwarp as nw
-from benchmarks.scenes import GARDEN, SurfelScene, cloud, garden, saharov
+from benchmarks.scenes import GARDEN, SurfelScene, cloud, garden, saharov, workload
 from benchmarks.suite import Options
-from benchmarks.timing import Measurement, figure, synchronize
+from benchmarks.timing import Measurement, figure, mean_ms
 from nexwarp.data import Scene, View
 from nexwarp.io.pictures import to_uint8
 from nexwarp.train.recipe import Config, TextureConfig
@@ -19,13 +19,12 @@ POINTS = 1000
 
 
 def run(options: Options) -> list[Measurement]:
-    small = cloud(500, 64, 48) if options.quick else cloud(5_000, 240, 160)
-    if not options.cuda:
-        return step(small, options)
     if options.quick:
-        scenes = [garden(20_000, 400, 259, options.data), small]
+        scenes = workload(replace(options, model=None))
+    elif options.cuda:
+        scenes = [garden(GARDEN, 1558, 1039, options.data), saharov(data=options.data), cloud(5_000, 240, 160)]
     else:
-        scenes = [garden(GARDEN, 1558, 1039, options.data), saharov(data=options.data), small]
+        scenes = [cloud(5_000, 240, 160)]
     return [m for scene in scenes for m in step(scene, options)]
 
 
@@ -33,12 +32,7 @@ def step(scene: SurfelScene, options: Options) -> list[Measurement]:
     trainer = make_trainer(scene, options)
     one = options.time("training step", trainer.step, **scene.facts)
     count = 3 if options.quick else 200 if options.cuda else 5
-    synchronize(options.device)
-    start = time.perf_counter()
-    for _ in range(count):
-        trainer.step()
-    synchronize(options.device)
-    rate = count / (time.perf_counter() - start)
+    rate = 1e3 / mean_ms(trainer.step, count, options.device)
     note = f"{count} steps in a row, density control included as it falls due. {scene.note}".strip()
     facts = scene.facts | {"note": note}
     return [one, figure("training rate", rate, options.device, unit="it/s", **facts)]

@@ -13,15 +13,11 @@ from torch.profiler import ProfilerActivity, profile
 BUSY = ("kernel", "gpu_memcpy", "gpu_memset")
 
 
-def gpu_time(run: Callable[[], Any], repeats: int = 10) -> tuple[float, dict[str, float]]:
-    """Return the milliseconds a call keeps the GPU busy, and the milliseconds of each of its kernels.
+def gpu_time(run: Callable[[], Any], repeats: int) -> float:
+    """Return the milliseconds that a call keeps the GPU busy, the mean of several calls.
 
-    Gaps in which the GPU waits for the host do not count, kernels that run side by side count once. The figures are
-    means over the repeats; launches of torch, of Warp and of CUDA graphs are all seen.
-
-    Args:
-        run: the call.
-        repeats: number of calls.
+    Gaps in which the GPU waits for the host do not count, kernels that run side by side count once. Launches of torch,
+    of Warp and of CUDA graphs are all seen.
     """
     run()
     torch.cuda.synchronize()
@@ -33,11 +29,7 @@ def gpu_time(run: Callable[[], Any], repeats: int = 10) -> tuple[float, dict[str
         file = Path(folder) / "trace.json"
         profiler.export_chrome_trace(str(file))
         events = json.loads(file.read_text())["traceEvents"]
-    spans = [(e["ts"], e["ts"] + e["dur"], e["name"]) for e in events if e.get("cat") in BUSY]
-    kernels: dict[str, float] = {}
-    for start, end, name in spans:
-        kernels[name] = kernels.get(name, 0.0) + (end - start) / repeats / 1e3
-    return busy([(start, end) for start, end, _ in spans]) / repeats / 1e3, kernels
+    return busy([(e["ts"], e["ts"] + e["dur"]) for e in events if e.get("cat") in BUSY]) / repeats / 1e3
 
 
 def busy(spans: list[tuple[float, float]]) -> float:

@@ -24,7 +24,7 @@ import tyro
 import warp as wp
 from torch import nn
 
-from benchmarks.timing import git_commit, synchronize
+from benchmarks.timing import git_commit, mean_ms, synchronize
 from nexwarp.data import Scene, demo_folder, load_scene
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.densify import DensityControl, split_surfels
@@ -172,13 +172,10 @@ def step_ms(trainer: Trainer, steps: int) -> float:
         synchronize(trainer.device)
         if isinstance(trainer, ParallelTrainer):
             trainer.ranks.barrier()
-        start = time.perf_counter()
-        for _ in range(max(steps // CHUNKS, 1)):
-            trainer.step()
-        synchronize(trainer.device)
+        elapsed = mean_ms(trainer.step, max(steps // CHUNKS, 1), trainer.device)
         if chunk:
-            times.append((time.perf_counter() - start) / max(steps // CHUNKS, 1))
-    return round(1000 * statistics.median(times), 4)
+            times.append(elapsed)
+    return round(statistics.median(times), 4)
 
 
 def communication_ms(trainer: ParallelTrainer, repeats: int) -> float:

@@ -1,6 +1,6 @@
 """Seeded scenes that all benchmarks share. Made on the CPU, so that they are the same on every device."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from nexwarp.model.surfels import Activated
 SH_DC = 0.28209479177387814
 GARDEN_WIDTH = 648  # of the images that garden_points.npz's intrinsics are for
 GARDEN, SAHAROV = 400_000, 40_000
+SHIPPED = {"levels": 8, "features": 4, "residual": True}  # the shape that `nexwarp train` gives a texture by default
 GARDEN_SPREAD = 1.5  # SCALE of the first measurements (2.80 million entries by bounding boxes), which targets refer to
 # The synthetic cloud is as large as the garden: (share of the surfels, area in square world units).
 GROUND_RADIUS, BALL_RADIUS, DOME_RADIUS = 3.0, 0.5, 4.0
@@ -129,6 +130,14 @@ def random_like(tensors: tuple[torch.Tensor, ...], seed: int = 1) -> list[torch.
     return [torch.randn(x.shape, generator=generator, dtype=x.dtype).to(x.device) for x in tensors]
 
 
+def both_ways(
+    forward: Callable[[], tuple[torch.Tensor, ...]], leaves: Sequence[torch.Tensor]
+) -> Callable[[], tuple[torch.Tensor, ...]]:
+    """Return a function that does the forward and the backward pass, and returns the gradients of the leaves."""
+    signals = random_like(forward())
+    return lambda: torch.autograd.grad(forward(), leaves, signals)
+
+
 def texture(scene: SurfelScene, **shape: Any) -> nw.NeuralTexture:
     """Return the scene's own texture, or a random one.
 
@@ -148,13 +157,21 @@ def texture(scene: SurfelScene, **shape: Any) -> nw.NeuralTexture:
     return made.to(scene.surfels.device)
 
 
+def large_scene(options: Options) -> SurfelScene:
+    """Return the garden."""
+    return garden(20_000, 400, 259, options.data) if options.quick else garden(data=options.data)
+
+
+def small_scene(options: Options) -> SurfelScene:
+    """Return a cloud that is small enough for a CPU."""
+    return cloud(500, 64, 48) if options.quick else cloud(20_000, 480, 320)
+
+
 def workload(options: Options) -> list[SurfelScene]:
     """Return the scenes for a stage: the garden on CUDA, a small cloud for any device, and the trained fox if named."""
-    small = cloud(500, 64, 48) if options.quick else cloud(20_000, 480, 320)
-    scenes = [small]
+    scenes = [small_scene(options)]
     if options.cuda:
-        large = garden(20_000, 400, 259, options.data) if options.quick else garden(data=options.data)
-        scenes.insert(0, large)
+        scenes.insert(0, large_scene(options))
     if options.model is not None:
         scenes.append(fox(options.model, options.data))
     return [scene.to(options.device) for scene in scenes]

@@ -11,7 +11,8 @@ from typing import Any
 import torch
 import warp as wp
 
-from benchmarks.timing import ROOT, Measurement, Repeats, measure
+from benchmarks.gpu_time import gpu_time
+from benchmarks.timing import ROOT, Measurement, Repeats, figure, measure
 from nexwarp.model.model_file import MODEL_FILE
 
 
@@ -43,7 +44,11 @@ class Options:
     def time_in_turns(self, runs: Mapping[str, Callable[[], Any]], **facts: Any) -> list[Measurement]:
         """Call `timing.measure` on this device, with few repeats when quick."""
         repeats = Repeats(seconds=0.0, warmup=1, least=2) if self.quick else Repeats()
-        return measure(runs, self.device, repeats=repeats, **facts)
+        return measure(runs, self.device, repeats, **facts)
+
+    def gpu_part(self, name: str, run: Callable[[], Any], repeats: int = 10, **facts: Any) -> Measurement:
+        """Return the time in which the GPU works for a call; the rest of the call's time is the host's."""
+        return figure(f"{name}, GPU's part", gpu_time(run, repeats), self.device, **facts)
 
 
 Stage = Callable[[Options], list[Measurement]]

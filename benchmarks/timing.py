@@ -90,25 +90,12 @@ class Repeats:
 
 
 def measure(
-    runs: Mapping[str, Callable[[], Any]],
-    device: torch.device,
-    *,
-    scene: str = "",
-    sizes: dict[str, Any] | None = None,
-    note: str = "",
-    repeats: Repeats = Repeats(),
+    runs: Mapping[str, Callable[[], Any]], device: torch.device, repeats: Repeats, **facts: Any
 ) -> list[Measurement]:
     """Time functions after warming them up: in turns, so that what slows the machine for a while slows them all.
 
     On CUDA each run lies between two events and is waited for, so that launches that are slower than the kernels count.
-
-    Args:
-        runs: what to time, by name; called without arguments. With several, the peak of memory is that of all.
-        device: where it runs.
-        scene: of the measurements.
-        sizes: of the measurements.
-        note: of the measurements.
-        repeats: how often each is timed.
+    With several functions, the peak of memory is that of all. `facts` are those of `figure`.
     """
     for run in list(runs.values()) * repeats.warmup:
         run()
@@ -117,43 +104,31 @@ def measure(
     reset_peak(device)
     start = time.perf_counter()
     times: dict[str, list[float]] = {name: [] for name in runs}
-    done, most = 0, repeats.seconds * len(runs)
-    while done < repeats.least or (done < repeats.most and time.perf_counter() - start < most):
+    done, longest = 0, repeats.seconds * len(runs)
+    while done < repeats.least or (done < repeats.most and time.perf_counter() - start < longest):
         for name, run in runs.items():
             times[name].append(clock(run))
         done += 1
-    facts: dict[str, Any] = {"scene": scene, "sizes": sizes, "note": note, "peak_mib": peak(device)}
+    facts["peak_mib"] = peak(device)
     return [figure(name, values, device, **facts) for name, values in times.items()]
 
 
-def figure(
-    name: str,
-    values: float | list[float],
-    device: torch.device,
-    *,
-    unit: str = "ms",
-    scene: str = "",
-    sizes: dict[str, Any] | None = None,
-    note: str = "",
-    peak_mib: float | None = None,
-) -> Measurement:
-    """Make a measurement of given values."""
+def figure(name: str, values: float | list[float], device: torch.device, **facts: Any) -> Measurement:
+    """Make a measurement of given values; `facts` are other fields of it, the scene at least."""
     values = values if isinstance(values, list) else [values]
     p10, median, p90 = np.quantile(values, [0.1, 0.5, 0.9]).tolist()
-    return Measurement(
-        name=name,
-        scene=scene,
-        device=device.type,
-        median=median,
-        p10=p10,
-        p90=p90,
-        unit=unit,
-        repeats=len(values),
-        peak_mib=peak_mib,
-        sizes=dict(sizes or {}),
-        note=note,
-        device_name=device_name(device.type),
-    )
+    facts |= {"repeats": len(values), "device_name": device_name(device.type)}
+    return Measurement(name=name, device=device.type, median=median, p10=p10, p90=p90, **facts)
+
+
+def mean_ms(run: Callable[[], Any], count: int, device: torch.device) -> float:
+    """Return the milliseconds of a call, by the wall clock, of several without a pause between them."""
+    synchronize(device)
+    start = time.perf_counter()
+    for _ in range(count):
+        run()
+    synchronize(device)
+    return 1e3 * (time.perf_counter() - start) / count
 
 
 def ratio(name: str, top: Measurement, bottom: Measurement, note: str = "") -> Measurement:
@@ -185,16 +160,11 @@ def peak(device: torch.device) -> float | None:
     if device.type == "cuda":
         pool = wp.get_mempool_used_mem_high(f"cuda:{device.index or 0}")
         return (torch.cuda.max_memory_allocated(device) + pool) / MIB
-    return process_memory("VmHWM")
-
-
-def process_memory(key: str = "VmRSS") -> float | None:
-    """A line of /proc/self/status in MiB, None where there is none."""
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
         return None
-    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{key}:")), None)
+    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM:")), None)
 
 
 @functools.cache
