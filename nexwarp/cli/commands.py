@@ -155,8 +155,8 @@ class Eval:
             facts = read_metrics(opened.folder)
             facts.pop("test_poses", None)  # of an earlier evaluation
             if self.refine_poses:
-                with display.counting(console, "fitting test poses", len(views)) as done:
-                    views, moves = fit_poses(model, views, progress=done)
+                with display.stages(console) as observe:
+                    views, moves = fit_poses(model, views, progress=partial(observe, "fitting test poses"))
                 facts["test_poses"] = {**moves}
             mask_mode = MASK_MODES[0] if opened.config is None else opened.config.mask_mode
             options = {"mask_mode": mask_mode, "metrics": self.metrics}
@@ -188,8 +188,9 @@ def evaluate_run(
     **options: Any,
 ) -> dict[str, Json]:
     """Evaluate a model on test views and write metrics.json with `facts`; return its entries. See `evaluate`."""
-    with display.counting(console, "evaluating", len(views)) as done:
-        results = evaluate(model, views, renders=run / RENDERS_FOLDER, progress=done, **options)
+    with display.stages(console) as observe:
+        progress = partial(observe, "evaluating")
+        results = evaluate(model, views, renders=run / RENDERS_FOLDER, progress=progress, **options)
     entries = facts | cast(dict[str, Json], results)
     write_json(run / METRICS_FILE, _finite(entries))
     return entries
@@ -226,9 +227,9 @@ class Render:
         if self.pictures.path is None and job.path is not None:
             surround = "surround" if job.path == "ellipse" else "do not surround"
             console.print(f"--path {job.path}, as the cameras {surround} what they look at")
-        with display.counting(console, "rendering", len(job)) as done:
-            job.render(model, done)
-        console.print(f"{len(job)} pictures in {opened.folder / RENDERS_FOLDER}")
+        with display.stages(console) as observe:
+            job.render(model, partial(observe, "rendering"))
+        console.print(f"{len(job.pictures)} pictures in {opened.folder / RENDERS_FOLDER}")
         if self.pictures.video is not None:
             console.print(f"{job.seconds:.2f} s of video in {self.pictures.video}")
 

@@ -94,26 +94,16 @@ def training(
         yield show
 
 
-def _bars(console: Console) -> Progress:
-    """Return bars that vanish at their end, shown in a terminal only."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console, disable=not console.is_terminal, transient=True)
-
-
-@contextmanager
-def counting(console: Console, title: str, total: int) -> Iterator[Callable[..., None]]:
-    """Show a progress bar; yield a function to call after each item."""
-    with _bars(console) as progress:
-        task = progress.add_task(title, total=total)
-        yield lambda _name=None: progress.advance(task)
-
-
 @contextmanager
 def stages(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """Show a bar, or lines in a log file, for each stage; yield a function of its name, items done and total."""
+    """Show a bar that vanishes at the end, or lines in a log file, for each stage of some work.
+
+    Yield a function to call with a stage's name, how many items of it are done, and their total.
+    """
     tasks: dict[str, TaskID] = {}
     shown = time.perf_counter()
-    with _bars(console) as progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as progress:
 
         def observe(stage: str, done: int, total: int) -> None:
             nonlocal shown

@@ -261,9 +261,10 @@ class Session(StageStore):
     def _judged_photos(self, trainer: Trainer, model: Model) -> dict[str, Values]:
         """Return the PSNR of the training photos; all ranks render a share."""
         views = with_cameras(trainer.scene.train, trainer.views.refined_cameras(trainer.poses))
-        with display.counting(self.console, "judging photos", len(views)) as done:
-            mode, ranks = trainer.config.mask_mode, self.ranks
-            return evaluate(model, views, mask_mode=mode, metrics=("psnr",), progress=done, ranks=ranks)["views"]
+        mode, ranks = trainer.config.mask_mode, self.ranks
+        with display.stages(self.console) as observe:
+            told = partial(observe, "judging photos")
+            return evaluate(model, views, mask_mode=mode, metrics=("psnr",), progress=told, ranks=ranks)["views"]
 
 
 @contextmanager

@@ -46,7 +46,7 @@ def evaluate(
     renders: Path | None = None,
     mask_mode: str = "ignore",
     metrics: Sequence[str] = ("psnr", "ssim"),
-    progress: Callable[[str], None] | None = None,
+    progress: Callable[[int, int], object] = lambda *_: None,
     ranks: Ranks | None = None,
 ) -> dict[str, Any]:
     """Render views, on the model's device, and compare them with their photos.
@@ -63,7 +63,7 @@ def evaluate(
             with the background colour.
         metrics: names among psnr, ssim, flip and lpips. FLIP and LPIPS need whole images: ignored pixels are copied
             from the photo.
-        progress: called with each view's name after the view is evaluated.
+        progress: called with the number of views that are evaluated, and their total.
         ranks: share the views, and return the same on all of them; only rank 0 writes. None is this process alone.
     """
     if not views:
@@ -85,8 +85,7 @@ def evaluate(
                     strip = side_by_side([photo, picture, error_map(picture, photo)], captions=captions)
                     save(renders / TEST / picture_name(view.name), picture)
                     save(renders / COMPARE / picture_name(view.name), strip)
-                if progress is not None:
-                    progress(view.name)
+                progress(len(results), len(views))
     summary: dict[str, object] = {"views": results, "convention": CONVENTION}
     for name in metrics:
         known = [value for values in results.values() if (value := values[name]) is not None]

@@ -23,7 +23,7 @@ Aim = tuple[Camera, torch.Tensor, torch.Tensor]  # camera; photo (H, W, 3); what
 
 
 def fit_poses(
-    model: Model, views: Sequence[View], *, steps: int = STEPS, progress: Callable[[str], None] | None = None
+    model: Model, views: Sequence[View], *, steps: int = STEPS, progress: Callable[[int, int], object] = lambda *_: None
 ) -> tuple[list[View], dict[str, float]]:
     """Return views with the poses at which the model's renderings fit their photos best, and entries for metrics.json.
 
@@ -41,8 +41,7 @@ def fit_poses(
         with torch.enable_grad():
             for view in views:
                 fitted.append(dataclasses.replace(view, camera=_fit(model, view, unit, steps)))
-                if progress is not None:
-                    progress(view.name)
+                progress(len(fitted), len(views))
     finally:
         for parameter in learned:
             parameter.requires_grad_(True)

@@ -207,17 +207,17 @@ class RenderJob:
     path: str | None = None  # name of the path, if any
     frame: Similarity = IDENTITY  # from that of the cameras to the coordinates of the buffers
 
-    def __len__(self) -> int:
-        return len(self.pictures)
-
     @property
     def seconds(self) -> float:
         """Duration of the path in seconds."""
         return sum(picture.is_frame for picture in self.pictures) / self.fps
 
     @torch.no_grad()
-    def render(self, model: Model, done: Callable[[], object] = lambda: None) -> None:
-        """Render all images, call `done` after each, and write them and the video. An incomplete video is deleted."""
+    def render(self, model: Model, progress: Callable[[int, int], object]) -> None:
+        """Render all images, and write them and the video. An incomplete video is deleted.
+
+        `progress` is called with the number of images that are done, and their total.
+        """
         frames = [picture for picture in self.pictures if picture.is_frame]
         asked = {"exposure": self.order.exposure, "order": self.order.order}
         changes = cast(RenderChanges, {name: value for name, value in asked.items() if value is not None})
@@ -228,7 +228,7 @@ class RenderJob:
                 size = (frames[0].camera.width, frames[0].camera.height)
                 append = stack.enter_context(video_writer(self.order.video, *size, self.fps))
             save = stack.enter_context(png_files())
-            for picture in self.pictures:
+            for number, picture in enumerate(self.pictures, 1):
                 if picture.buffers:
                     buffers = render_buffers(model, picture.camera, **changes)
                     save_buffers(picture.file.with_suffix(".exr"), moved_buffers(buffers, self.frame))
@@ -243,7 +243,7 @@ class RenderJob:
                     save_exr(picture.file.with_suffix(".exr"), {"image": light})
                 if append is not None and picture.is_frame:
                     append(pixels)
-                done()
+                progress(number, len(self.pictures))
         if frames:  # an earlier, longer path may have left others
             for file in frames[0].file.parent.iterdir():
                 if re.fullmatch(r"\d{4,}\.(png|exr)", file.name) and int(file.stem) >= len(frames):

@@ -202,9 +202,9 @@ def rendered(model: nw.Model, camera: nw.Camera) -> torch.Tensor:
 
 def test_figures_are_those_of_the_written_pictures(tmp_path, model):
     views = views_of(model)
-    done: list[str] = []
-    result = evaluate(model, views, renders=tmp_path, progress=done.append)
-    assert done == list(NAMES) == list(result["views"])
+    done: list[tuple[int, int]] = []
+    result = evaluate(model, views, renders=tmp_path, progress=lambda *call: done.append(call))
+    assert done == [(1, 2), (2, 2)] and list(result["views"]) == list(NAMES)
     assert result["convention"] == CONVENTION
     for view in views:
         written = picture(tmp_path / "test" / Path(view.name).with_suffix(".png"))
