@@ -1,6 +1,6 @@
-"""Tile lists (paper Sec. 3, after 3DGS): entries (tile, surfel), counted and emitted in depth order, found by tile.
+"""Tile lists (paper Sec. 3, after 3DGS): entries (tile, surfel), counted and emitted in depth order.
 
-A thread is a surfel, a tile or an entry, as each kernel says. Written are integers: nothing here is differentiated.
+A thread is a surfel. Written are integers: nothing here is differentiated.
 
 The threads of a warp share the tile rows of their 32 surfels, 32 rows at once: most surfels cover one to three rows,
 near ones hundreds. They share the entries of these rows, too, and write them in order.
@@ -158,25 +158,3 @@ def emit(  # noqa: PLR0913  # a kernel entry point
     for at in range(int(wp.min(totals[surfel_count - 1], room)) + thread, entries.shape[0], threads):
         tiles[at] = no_tile
         entries[at] = 0
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def tile_offsets(first: int, tiles: ints, total: int, offsets: ints):
-    """Start of each tile's entries in the sorted list, by binary search: one thread a tile, and one for the end."""
-    tile = first + wp.tid()
-    low = int(0)
-    high = int(total)
-    while low < high:
-        middle = (low + high) // 2
-        if tiles[middle] < tile:
-            low = middle + 1
-        else:
-            high = middle
-    offsets[tile] = low
-
-
-@wp.kernel(enable_backward=False, module="unique")
-def surfel_ids(first: int, entries: ints, surfels: ints, ids: ints):
-    """Surfel of each sorted entry."""
-    k = first + wp.tid()
-    ids[k] = surfels[entries[k]]

@@ -255,7 +255,7 @@ def stream_on(stream: torch.cuda.Stream) -> wp.Stream:
     return _stream(stream.device_index, stream.cuda_stream)
 
 
-# Warp's own sorts and scans go to its current stream, which is one for all threads: who sets it holds this.
+# Warp's own sorts go to its current stream, which is one for all threads: who sets it holds this.
 warp_streams = threading.RLock()
 if hasattr(os, "register_at_fork"):
     # Otherwise a child that is forked while another thread holds it would wait forever.

@@ -95,7 +95,7 @@ def intersect_tiles(
     threads = kernels.list_threads(count, means.is_cuda)
     totals, ends = (torch.empty(count, dtype=x, device=means.device) for x in (torch.int64, torch.int32))
     launch(means, kernels.count, threads, arguments, [totals], sharing=UNEVEN)
-    _scan(totals)
+    totals.cumsum_(0)
     learns = room is None and means.is_cuda
     exact = room is None and not learns
     if room is None:
@@ -113,11 +113,10 @@ def intersect_tiles(
     if learns:
         _ask(ends, kind)
     surfel_ids, entries = values[:room], values[:0]
-    if exact:
-        surfel_ids, entries = ends.new_empty(room), values[:room]
-        launch(means, kernels.surfel_ids, room, [entries, surfel_of], [surfel_ids])
-    offsets = order.new_empty(columns * rows + 1)
-    launch(means, kernels.tile_offsets, len(offsets), [tile_ids[:room], room], [offsets])
+    if surfel_of is not None:
+        surfel_ids, entries = surfel_of.index_select(0, values[:room]), values[:room]
+    tiles = torch.arange(columns * rows + 1, dtype=torch.int32, device=means.device)
+    offsets = torch.searchsorted(tile_ids[:room], tiles, out_int32=True)
     return Tiles(order, ends, surfel_ids, entries, offsets, reaches, columns, exact, kind)
 
 
@@ -139,15 +138,6 @@ def _sort(keys: torch.Tensor, values: torch.Tensor, count: int, bits: int) -> No
     sorted_keys, sorted_values = warp_array(keys, wp.uint32), warp_array(values, wp.int32)
     with warp_streams, wp.ScopedStream(stream_of(keys), sync_enter=False):
         wp.utils.radix_sort_pairs(sorted_keys, sorted_values, count, end_bit=bits)
-
-
-def _scan(counts: torch.Tensor) -> None:
-    """Turn counts into ends in place."""
-    if len(counts) == 0:
-        return
-    ends = warp_array(counts, wp.int64)
-    with warp_streams, wp.ScopedStream(stream_of(counts), sync_enter=False):
-        wp.utils.array_scan(ends, ends, inclusive=True)
 
 
 def _total(totals: torch.Tensor, tiles: int) -> int:
