@@ -82,7 +82,7 @@ def _find_model(path: Path, need_points: bool) -> tuple[Path, str, Path | None]:
     Points lie in points3D.bin or .txt, as the model, else in points3D.ply; None without any. Of several models it is
     the one with the most registered photos, else the first of `_folders`.
     """
-    partial = None
+    incomplete = None
     models: list[tuple[Path, str, Path | None]] = []
     for folder in _folders(path):
         for end in FORMATS:
@@ -95,13 +95,13 @@ def _find_model(path: Path, need_points: bool) -> tuple[Path, str, Path | None]:
             if not missing:
                 models.append((folder, end, points))
                 break
-            if begun and partial is None:
-                partial = f"{path}: incomplete COLMAP model in {folder}: {' and '.join(missing)} not found"
-                partial += "; --points FILE.ply stands in for it" if missing == [own.name] else ""
+            if begun and incomplete is None:
+                incomplete = f"{path}: incomplete COLMAP model in {folder}: {' and '.join(missing)} not found"
+                incomplete += "; --points FILE.ply stands in for it" if missing == [own.name] else ""
     if models:
         return models[0] if len(models) == 1 else max(models, key=lambda model: _count_images(*model[:2]))
     raise FileNotFoundError(
-        partial
+        incomplete
         or f"{path}: no COLMAP model found, expected cameras, images and points3D (.bin or .txt) "
         "in sparse/0, in sparse or in the folder itself"
     )

@@ -64,7 +64,7 @@ MUTATIONS = [
     # 29: data and cameras
     Mutation("data/lens.py", "+ p2 * (r + 2 * x * x)", "+ p2 * (r + x * x)", "tests/data/test_lens.py tests/data/inputs/test_lenses.py"),
     Mutation("data/lens.py", "width / self.width, height / self.height", "width / self.width, width / self.width", "tests/data/test_scene.py"),
-    Mutation("data/colmap.py", "2 * (x * y - w * z), 2 * (x * z + w * y)),", "2 * (x * y + w * z), 2 * (x * z + w * y)),", "tests/data/test_scene.py"),
+    Mutation("data/colmap.py", "Rotation3d(np.array([x, y, z, w]))", "Rotation3d(np.array([x, y, z, -w]))", "tests/data/test_scene.py"),
     Mutation("data/colmap.py", "models[0] if len(models) == 1 else max(", "models[0] if models else max(", "tests/data"),
     Mutation("data/images.py", "WHITE = 128", "WHITE = 200", "tests/data/inputs/test_masks.py"),
     Mutation("data/transforms.py", "applied[:3] *= number_of(", "applied[:3] /= number_of(", "tests/data/inputs/test_formats.py -k applied"),
