@@ -33,6 +33,7 @@ class Photo:
     file: Path
     viewmat: np.ndarray  # (4, 4) float64, world to camera, OpenCV axes; a capture's "world" has its `origin`
     lens: Lens  # the size of the image file may differ from the lens's by a factor
+    test: bool | None = None  # whether it is to judge by, not to learn from; None if the scene says it of no photo
     mask: Path | None = None  # None if the scene names none
     depth: Path | None = None  # its depth map; None if it has none
     face: str | None = None  # of a panorama, a key of `nexwarp.data.lens.FACES`; None for other photos
@@ -77,7 +78,6 @@ class Capture:
     photos: list[Photo]  # sorted by name
     cloud: Cloud | None  # None if the scene has none
     origin: np.ndarray  # (3,) float64, world coordinates of the origin of photos and cloud; see `Scene.origin`
-    test: frozenset[str] | None = None  # names of the test photos; None for every eighth photo
     background: tuple[float, float, float] | None = None  # behind transparent photos; None drops their alpha
 
     @classmethod
@@ -86,7 +86,6 @@ class Capture:
         source: Path,
         photos: list[Photo],
         cloud: Cloud | None,
-        test: frozenset[str] | None = None,
         background: tuple[float, float, float] | None = None,
     ) -> "Capture":
         """Sort photos by name, and move photos and cloud from the world frame to one near them where that is needed.
@@ -108,7 +107,7 @@ class Capture:
                 f"{tuple(origin.tolist())}, the scene's `origin`",
                 stacklevel=2,
             )
-        return cls(source, photos, cloud, origin, test, background)
+        return cls(source, photos, cloud, origin, background)
 
 
 def far_origin(viewmats: Sequence[np.ndarray], size: int, cloud: Cloud | None) -> np.ndarray:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -348,12 +349,10 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback) -> 
         cloud = capture.cloud
         if source.points is not None:
             cloud = _given_points(Path(source.points), capture)
-        assert capture.test is not None
-        tests = [photo.name in capture.test for photo in capture.photos]
-        viewmats = [photo.viewmat for photo, test in zip(capture.photos, tests, strict=True) if not test]
+        viewmats = [photo.viewmat for photo in capture.photos if not photo.test]
         scale = _scene_scale(str(capture.source), viewmats, cloud)
         background = capture.background if color is None else color
-        train, held_out = _read_views(source, path, capture, tests, background, NEAR_FRACTION * scale, progress)
+        train, held_out = _read_views(source, path, capture, background, NEAR_FRACTION * scale, progress)
         train = fit_depths(train, cloud, path)
         if color is None and all(view.alpha is None for view in train + held_out):
             background = None  # behind opaque photos there is none to see
@@ -410,7 +409,6 @@ def _read_views(
     source: SceneSource,
     path: Path,
     capture: Capture,
-    tests: list[bool],
     background: tuple[float, float, float] | None,
     near: float,
     progress: ProgressCallback,
@@ -420,9 +418,8 @@ def _read_views(
     positions = None if capture.cloud is None else capture.cloud.positions.astype(np.float32)
     reader = ViewReader(source.downscale, background, alpha_mask, source.linear, positions)
     photos = with_depths(path, _with_masks(path, capture.photos, source.masks))
-    photos = [dataclasses.replace(x, depth=None) if test else x for x, test in zip(photos, tests, strict=True)]
-    plans = read_in_threads(reader.plan, photos, MAX_READERS)
-    jobs = [job for plan in plans for job in plan]
+    photos = [dataclasses.replace(photo, depth=None) if photo.test else photo for photo in photos]
+    jobs = list(chain.from_iterable(read_in_threads(reader.plan, photos, MAX_READERS)))
     channels = 3 + (background is not None) + (alpha_mask or any(job.photo.mask for job in jobs))
     channels += DEPTH_BYTES * any(job.photo.depth for job in jobs)
     workers = _workers(source, path, channels, jobs)
@@ -430,9 +427,8 @@ def _read_views(
     views = read_in_threads(
         lambda job: reader.read(job, near, (x, y, z)), jobs, workers, lambda done: progress(done, len(jobs))
     )
-    held_out = [test for plan, test in zip(plans, tests, strict=True) for _ in plan]
-    train = [view for view, test in zip(views, held_out, strict=True) if not test]
-    return train, [view for view, test in zip(views, held_out, strict=True) if test]
+    train = [view for job, view in zip(jobs, views, strict=True) if not job.photo.test]
+    return train, [view for job, view in zip(jobs, views, strict=True) if job.photo.test]
 
 
 def _make_scene(
@@ -472,9 +468,12 @@ def _given_points(file: Path, capture: Capture) -> Cloud:
 
 
 def _read_capture(source: SceneSource, path: Path) -> Capture:
-    """Read a capture without the photos to exclude; `test` names the test photos, which do not depend on those."""
+    """Read a capture without the photos to exclude, on which it does not depend which photos are for testing."""
     capture = _read_files(source, path)
-    test = frozenset(photo.name for photo in capture.photos[::TEST_EVERY]) if capture.test is None else capture.test
+    photos = [
+        dataclasses.replace(photo, test=index % TEST_EVERY == 0 if photo.test is None else photo.test)
+        for index, photo in enumerate(capture.photos)
+    ]
     excluded: set[str] = set()
     for pattern in source.exclude:
         matched = _matching([photo.name for photo in capture.photos], pattern)
@@ -482,10 +481,10 @@ def _read_capture(source: SceneSource, path: Path) -> Capture:
             example = capture.photos[0].name
             raise ValueError(f"exclude: no photo of {capture.source} is named {short(pattern)}, as {example} is")
         excluded |= matched
-    photos = [photo for photo in capture.photos if photo.name not in excluded]
-    if excluded and all(photo.name in test for photo in photos):
+    photos = [photo for photo in photos if photo.name not in excluded]
+    if excluded and all(photo.test for photo in photos):
         raise ValueError(f"exclude: expected to leave a training photo of {capture.source}, got none")
-    return dataclasses.replace(capture, photos=photos, test=test)
+    return dataclasses.replace(capture, photos=photos)
 
 
 def _matching(names: Sequence[str], pattern: str) -> set[str]:

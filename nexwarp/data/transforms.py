@@ -67,7 +67,6 @@ class _Frames:
     file: Path
     data: JsonObject
     photos: list[Photo]  # that exist, sorted by name
-    held_out: set[str]  # names of the photos of ScanNet++'s `test_frames`
     missing: list[str]  # names of the photos that do not exist
     to_original: np.ndarray  # (4, 4) float64 similarity from the file's world frame to the original one
     follow_links: bool  # whether files may lie behind links that leave the scene's folder
@@ -77,8 +76,7 @@ def read_nerfstudio(path: Path, images: str, follow_links: bool = False, skip_mi
     """Read `transforms.json` of the scene in `path`; `images` replaces "images" in the file."""
     frames = _read_frames(path / NERFSTUDIO_FILE, images, follow_links, skip_missing)
     report_unused(frames.file, path / images, frames.photos)
-    photos, test = _split(frames)
-    return Capture.of(frames.file, photos, _points(frames), test=test)
+    return Capture.of(frames.file, _split(frames), _points(frames))
 
 
 def read_blender(path: Path, images: str, follow_links: bool = False, skip_missing: bool = False) -> Capture:
@@ -93,24 +91,25 @@ def read_blender(path: Path, images: str, follow_links: bool = False, skip_missi
     cloud = _points(train, BLENDER_POINTS)
     others = (path / BLENDER_FILES[part] for part in ("test", "val"))
     file = next((other for other in others if other.is_file()), None)
-    if file is None:
-        test = frozenset(train.held_out) or None
-        return Capture.of(train_file, train.photos, cloud, test=test, background=WHITE)
-    held_out = _read_frames(file, images, follow_links, skip_missing).photos
-    test = frozenset(photo.name for photo in held_out) | train.held_out
-    again = [photo.name for photo in train.photos if photo.name in test - train.held_out]
-    if again:
-        raise ValueError(f"{file}: {again[0]} is in {train_file.name} too, expected other photos to judge by")
-    return Capture.of(train_file, train.photos + held_out, cloud, test=test, background=WHITE)
+    photos = train.photos
+    if file is not None:
+        held_out = _read_frames(file, images, follow_links, skip_missing).photos
+        again = {photo.name for photo in photos} & {photo.name for photo in held_out}
+        if again:
+            raise ValueError(f"{file}: {min(again)} is in {train_file.name} too, expected other photos to judge by")
+        photos = [dataclasses.replace(photo, test=bool(photo.test)) for photo in photos]
+        photos += [dataclasses.replace(photo, test=True) for photo in held_out]
+    return Capture.of(train_file, photos, cloud, background=WHITE)
 
 
 def _read_frames(file: Path, images: str, follow_links: bool, skip_missing: bool) -> _Frames:
     data = read_object(file, finite=True)
     entries = {f"frame {index}": entry for index, entry in enumerate(list_of(file, data, "frames"))}
-    if data.get("test_frames") is not None:
+    has_tests = data.get("test_frames") is not None  # of ScanNet++
+    if has_tests:
         entries |= {f"test frame {index}": entry for index, entry in enumerate(list_of(file, data, "test_frames"))}
     _name_unread(file, data, entries.values())
-    frames = _Frames(file, data, [], set(), [], _inverse_applied(file, data), follow_links)
+    frames = _Frames(file, data, [], [], _inverse_applied(file, data), follow_links)
     for place, entry in entries.items():
         named = _file_name(f"{file}: {place}", "file_path", entry.get("file_path"), file.parent)
         where = f"{file}: {place} ({named})"
@@ -121,9 +120,10 @@ def _read_frames(file: Path, images: str, follow_links: bool, skip_missing: bool
         name = _view_name(str(PurePosixPath(named).with_name(photo_file.name)))
         folder = file.parent / images if PurePosixPath(named).is_relative_to("images") else file.parent
         inside_folder(f"{where}: file_path", photo_file, folder, follow_links)
-        frames.photos.append(_photo(where, frames, entry, name, photo_file))
-        if place.startswith("test"):
-            frames.held_out.add(name)
+        test = place.startswith("test") if has_tests else None
+        mask, depth = (_named_file(where, frames, entry, key) for key in ("mask_path", "depth_file_path"))
+        viewmat, lens = _frame_viewmat(where, entry, frames.to_original), _frame_lens(where, entry, data, photo_file)
+        frames.photos.append(Photo(name, photo_file, viewmat, lens, test, mask, depth))
     report_missing(file, frames.missing, len(entries), skip_missing)
     frames.photos.sort(key=lambda photo: photo.name)
     return frames
@@ -138,12 +138,6 @@ def _name_unread(file: Path, data: JsonObject, entries: Iterable[JsonObject]) ->
     if unread:
         names = one_line(", ".join(sorted(unread)), 400)
         warnings.warn(f"{file}: keys that are not read: {names}", stacklevel=2)
-
-
-def _photo(where: str, frames: _Frames, entry: JsonObject, name: str, file: Path) -> Photo:
-    mask, depth = (_named_file(where, frames, entry, key) for key in ("mask_path", "depth_file_path"))
-    lens = _frame_lens(where, entry, frames.data, file)
-    return Photo(name, file, _frame_viewmat(where, entry, frames.to_original), lens, mask, depth)
 
 
 def _named_file(where: str, frames: _Frames, entry: JsonObject, key: str) -> Path | None:
@@ -180,8 +174,8 @@ def _find(where: str, folder: Path, named: str, images: str) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-def _split(frames: _Frames) -> tuple[list[Photo], frozenset[str] | None]:
-    """Return the photos in use and the names of the test photos; None if the file has no split."""
+def _split(frames: _Frames) -> list[Photo]:
+    """Return the photos in use, split by the file's lists of names if it has any."""
 
     def forms(name: str) -> set[str]:
         plain = plain_name(_view_name(name))
@@ -202,9 +196,9 @@ def _split(frames: _Frames) -> tuple[list[Photo], frozenset[str] | None]:
         if unknown:
             raise ValueError(f"{frames.file}: {key}: expected photos of the frames, got {unknown[0]}")
     if not lists:
-        return frames.photos, frozenset(frames.held_out) or None
+        return frames.photos
     held_out = lists.get("test_filenames") or lists.get("val_filenames") or set()
-    tests = frozenset(name for name, forms in names_of.items() if forms & held_out) | frames.held_out
+    tests = {photo.name for photo in frames.photos if photo.test or names_of[photo.name] & held_out}
     train = {name for name, forms in names_of.items() if forms & lists.get("train_filenames", forms)}
     if train & tests and "train_filenames" in lists:
         both = f"{len(train & tests)} photos are listed for training and testing; they are used for testing only"
@@ -213,7 +207,8 @@ def _split(frames: _Frames) -> tuple[list[Photo], frozenset[str] | None]:
         raise ValueError(
             f"{frames.file}: train_filenames: expected at least one photo that is not for testing, got none"
         )
-    return [photo for photo in frames.photos if photo.name in train | tests], tests
+    used = (photo for photo in frames.photos if photo.name in train | tests)
+    return [dataclasses.replace(photo, test=photo.name in tests) for photo in used]
 
 
 def _points(frames: _Frames, beside: str | None = None) -> Cloud | None:
