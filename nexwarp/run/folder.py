@@ -119,29 +119,24 @@ class RunRecord:
         """Return the entries of config.json; paths are absolute."""
         data: dict[str, Json] = {"scene": dataclasses.asdict(self.source.absolute()), "device": self.device}
         data["config"] = self.config.as_dict()
-        if self.teachers:
-            data["teachers"] = [str(path.resolve()) for path in self.teachers]
-        if self.init is not None:
-            data["init"] = str(self.init.resolve())
-        if self.own.count:
-            data["own_teachers"] = dataclasses.asdict(self.own)
-        return data
+        options: dict[str, Json] = {
+            "teachers": [str(path.resolve()) for path in self.teachers],
+            "init": None if self.init is None else str(self.init.resolve()),
+            "own_teachers": dataclasses.asdict(self.own) if self.own.count else None,
+        }
+        return data | {name: value for name, value in options.items() if value}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "RunRecord":
         """Read `as_dict`, of any version; one of `READ_ERRORS` says what is wrong with the entries."""
         check_version(data.get("format_version", 1), RUN_VERSION)
-        source = SceneSource.from_dict(data["scene"])
-        teachers = data.get("teachers", [])
-        if not isinstance(teachers, list) or not all(isinstance(path, str) for path in teachers):
-            raise ValueError(f"teachers: expected a list of paths, got {teachers!r}")
+        source, init = SceneSource.from_dict(data["scene"]), data.get("init")
+        teachers = tuple(Path(path) for path in data.get("teachers", []))
         config, own = config_from_dict(data["config"]), _own_teachers(data.get("own_teachers"))
         if own.count * own.iterations >= config.iterations:
             raise ValueError(f"own_teachers: expected fewer iterations than the run's {config.iterations}, got {own}")
-        if (init := data.get("init")) is not None and not isinstance(init, str):
-            raise ValueError(f"init: expected a path, got {init!r:.60}")
         start = None if init is None else Path(init)
-        return cls(source, config, str(data.get("device", "cpu")), tuple(map(Path, teachers)), own, start)
+        return cls(source, config, str(data.get("device", "cpu")), teachers, own, start)
 
 
 def _own_teachers(data: object) -> OwnTeachers:
@@ -289,7 +284,8 @@ def create_run(run: Path, record: RunRecord) -> list[str]:
     with written_aside(run / CONFIG_FILE) as temporary:
         temporary.write_bytes((json.dumps(record.as_dict(), indent=2) + "\n").encode())
         sync(temporary)
-        foreign = delete_files(run, keep=(CONFIG_FILE, LOCK_FILE, temporary.name))
+        own, foreign = list_files(run)
+        delete_files(run, [name for name in own if name not in (CONFIG_FILE, LOCK_FILE, temporary.name)])
         sync(run)
     return foreign
 
@@ -344,14 +340,7 @@ def list_files(run: Path) -> tuple[list[str], list[str]]:
     return sorted(own), sorted(foreign)
 
 
-def delete_files(run: Path, keep: Iterable[str] = ()) -> list[str]:
-    """Delete the files of a run but those to keep, and the folders that this leaves empty; return what is not ours."""
-    own, foreign = list_files(run)
-    _delete(run, [name for name in own if name not in keep])
-    return foreign
-
-
-def _delete(run: Path, names: Iterable[str]) -> None:
+def delete_files(run: Path, names: Iterable[str]) -> None:
     """Delete files of a run, and the folders that this leaves empty."""
     folders: set[Path] = set()
     for name in names:
@@ -369,7 +358,7 @@ def remove_leftovers(run: Path) -> None:
         locked = folder in CHECKPOINTS or (not folder and not base.startswith(".camera_path_"))
         if (is_temporary(base) and locked) or re.fullmatch(_ASIDE, folder):
             leftovers.append(name)
-    _delete(run, leftovers)
+    delete_files(run, leftovers)
     remove_empty([folder for folder in run.iterdir() if re.fullmatch(_ASIDE, folder.name)])
 
 
