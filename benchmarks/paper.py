@@ -17,10 +17,10 @@ from statistics import fmean
 
 import torch
 
-from benchmarks.quality.documents import MISSING, caption, markdown
+from benchmarks.quality.documents import MISSING, caption
 from benchmarks.quality.jobs import DEFAULT, ITERATIONS, PAPER, RAW, Row, TrainingJob
-from benchmarks.quality.results import Results, read_results
-from benchmarks.quality.run import missing_jobs, run_jobs
+from benchmarks.quality.results import Results, markdown, read_results
+from benchmarks.quality.run import Places, missing_jobs, run_jobs
 from nexwarp.errors import SettingError
 from nexwarp.run.evaluate import check_metrics
 
@@ -158,7 +158,7 @@ def main(arguments: list[str] | None = None) -> int:
             check_metrics(["lpips"], torch.device("cpu"))
         except SettingError as error:
             print(str(error).removeprefix("--metrics: "), file=sys.stderr, flush=True)
-    failed = run_jobs(missing, ROWS, options.data, options.out, options.jobs)
+    failed = run_jobs(missing, ROWS, Places(options.data), options.out, options.jobs)
     results = read_results([options.out]) if options.out.exists() else {}
     shown = [results[job] for job in jobs.values() if job in results]
     rows = ", ".join(sorted({job.row for job in jobs.values()}))

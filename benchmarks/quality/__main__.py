@@ -13,7 +13,7 @@ from benchmarks.quality.documents import MISSING, blocks, fill
 from benchmarks.quality.jobs import FOLDS, ITERATIONS, ROWS, SCENES, SIZE, TABLES, Row, TrainingJob, table_jobs
 from benchmarks.quality.results import read_results
 from benchmarks.quality.results import table as results_table
-from benchmarks.quality.run import missing_jobs, run_jobs
+from benchmarks.quality.run import Places, missing_jobs, run_jobs
 from benchmarks.timing import ROOT
 
 
@@ -21,8 +21,8 @@ def train(options: argparse.Namespace) -> int:
     """Run the trainings that the results file lacks."""
     rows = ROWS | own_rows(options.row or ())
     jobs = missing_jobs(wanted_jobs(options, rows), options.out)
-    folders = {"pictures": options.pictures, "models": options.models}
-    failed = run_jobs(jobs, rows, options.data, options.out, options.jobs, **folders, curve=options.curve)
+    places = Places(options.data, options.pictures, options.models, options.curve)
+    failed = run_jobs(jobs, rows, places, options.out, options.jobs)
     return 1 if failed else 0
 
 

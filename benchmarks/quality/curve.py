@@ -1,6 +1,5 @@
 """Quality over the seconds of a training, of ours and of gsplat's."""
 
-import statistics
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 import torch
 
+from benchmarks.quality.results import mean_of_known
 from nexwarp.cameras.camera import Camera
 from nexwarp.data import Scene
 from nexwarp.io.pictures import to_uint8
@@ -45,8 +45,7 @@ class Curve:
             render = image()
             pairs = [(to_uint8(render(v.camera)).cpu(), to_uint8(v.image), v.mask) for v in self.scene.test]
             values = {name: [METRICS[name](*pair) for pair in pairs] for name in DRAWN}
-        known = {name: [x for x in each if x is not None] for name, each in values.items()}
-        means = {name: statistics.fmean(each) if each else None for name, each in known.items()}
+        means = {name: mean_of_known(each) for name, each in values.items()}
         self.points.append({"seconds": seconds, **means})
         self.begin = time.perf_counter() - seconds
 

@@ -1,11 +1,11 @@
 """Markdown of the documents' tables, by the names of the blocks that they fill."""
 
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from benchmarks.quality.jobs import DEFAULT, ITERATIONS, PEERS, RAW, RAW_PEER, SCENES, SIZE
-from benchmarks.quality.results import Results
+from benchmarks.quality.results import Results, markdown
 
 # A block stands between the lines <!-- results: NAME --> and <!-- end of results -->.
 BLOCK = re.compile(r"(<!-- results: ([\w-]+) -->\n)(.*?)(<!-- end of results -->)", re.DOTALL)
@@ -84,12 +84,6 @@ def peers(results: Results) -> str:
         lines.append([scene, f"{size:,}", *(figures(cell) for cell in (own, example, best)), margin])
     header = ["scene", "primitives", "nexwarp", "gsplat as in its example", "gsplat, best row", "nexwarp less best"]
     return f"{markdown(header, lines)}\n\n{caption(shown)}"
-
-
-def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """Return a table of cells."""
-    head, *rest = (f"| {' | '.join(cells)} |" for cells in (header, *lines))
-    return "\n".join([head, "|---" * len(header) + "|", *rest])
 
 
 def caption(shown: Collection[Mapping[str, Any]], command: str = "benchmarks.quality train") -> str:

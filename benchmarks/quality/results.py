@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import statistics
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +62,12 @@ def result_line(job: TrainingJob, result: dict[str, Any]) -> str:
     )
 
 
+def mean_of_known(values: Iterable[float | None]) -> float | None:
+    """Return the mean of those values that are there; None without any."""
+    known = [x for x in values if x is not None]
+    return statistics.fmean(known) if known else None
+
+
 def table(results: Results) -> str:
     """Return Markdown: means and standard deviations over seeds, by scene, variant, size and iterations."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
@@ -69,13 +75,18 @@ def table(results: Results) -> str:
         key = (job.scene, job.variant, job.downscale, job.size, job.iterations, job.row)
         groups.setdefault(key, []).append(result)
     header = ["scene", "size", "iterations", "row", *(title for title, _ in COLUMNS.values()), "seeds"]
-    lines = [f"| {' | '.join(header)} |", "|---" * len(header) + "|"]
+    lines = []
     for (scene, variant, downscale, size, iterations, row), members in sorted(groups.items(), key=lambda x: x[0]):
         name = f"{scene} {variant}".strip() + (f", photos reduced by {downscale}" if downscale > 1 else "")
         figures = [_spread([r.get(figure) for r in members], digits) for figure, (_, digits) in COLUMNS.items()]
-        cells = [name, f"{size:,}", f"{iterations:,}", row, *figures, str(len(members))]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append([name, f"{size:,}", f"{iterations:,}", row, *figures, str(len(members))])
+    return markdown(header, lines)
+
+
+def markdown(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Return a table of cells."""
+    head, *rest = (f"| {' | '.join(cells)} |" for cells in (header, *lines))
+    return "\n".join([head, "|---" * len(header) + "|", *rest])
 
 
 def _spread(values: list[float | None], digits: int) -> str:

@@ -8,8 +8,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict
-from functools import partial
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import torch
 from benchmarks import peer_gsplat
 from benchmarks.quality.curve import Curve, RenderImage, WatchedStages
 from benchmarks.quality.jobs import Row, TrainingJob, config_of, scene_of
-from benchmarks.quality.results import drop_unfinished, read_results, result_line
+from benchmarks.quality.results import drop_unfinished, mean_of_known, read_results, result_line
 from benchmarks.timing import git_commit
 from nexwarp.data import Scene
 from nexwarp.io.pictures import error_map, save_png, side_by_side, to_uint8
@@ -38,33 +37,31 @@ def missing_jobs(wanted: Sequence[TrainingJob], out: Path) -> list[TrainingJob]:
     return jobs
 
 
-def run_jobs(
-    jobs: Sequence[TrainingJob],
-    rows: Mapping[str, Row],
-    data: Path,
-    out: Path,
-    workers: int = 1,
-    pictures: Path | None = None,
-    models: Path | None = None,
-    *,
-    curve: bool = False,
-) -> int:
-    """Append the result of each job to a results file; return how many failed.
+@dataclass(frozen=True)
+class Places:
+    """Where trainings find their scenes, and what is kept of them.
 
-    Args:
-        jobs: what to train.
-        rows: by name, at least those of the jobs.
-        data: as of `run_job`, as are `pictures`, `models` and `curve`.
-        out: the results file.
-        workers: trainings at once.
-        pictures: see `data`.
-        models: see `data`.
-        curve: see `data`.
+    Attributes:
+        data: folder of the scenes.
+        pictures: folder for photo, rendering and error of each test view.
+        models: folder to keep the models in.
+        curve: keep metrics at times of the training; see `Curve`.
+    """
+
+    data: Path
+    pictures: Path | None = None
+    models: Path | None = None
+    curve: bool = False
+
+
+def run_jobs(jobs: Sequence[TrainingJob], rows: Mapping[str, Row], places: Places, out: Path, workers: int = 1) -> int:
+    """Append the result of each job to a results file, so many trainings at once; return how many failed.
+
+    `rows` has, by name, at least those of the jobs.
     """
     failed = 0
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        do = partial(run_job, data=data, pictures=pictures, models=models, curve=curve)
-        futures = {pool.submit(do, job, row=rows[job.row]): job for job in jobs}
+        futures = {pool.submit(run_job, job, rows[job.row], places): job for job in jobs}
         for future in as_completed(futures):
             job = futures[future]
             try:
@@ -79,24 +76,8 @@ def run_jobs(
     return failed
 
 
-def run_job(
-    job: TrainingJob,
-    data: Path,
-    row: Row,
-    *,
-    pictures: Path | None = None,
-    models: Path | None = None,
-    curve: bool = False,
-) -> dict[str, Any]:
+def run_job(job: TrainingJob, row: Row, places: Places) -> dict[str, Any]:
     """Train, render the test views and compare them with their photos.
-
-    Args:
-        job: what to train.
-        data: folder of the scenes.
-        row: the job's.
-        pictures: folder for photo, rendering and error of each test view.
-        models: folder to keep the model in.
-        curve: add `curve`, metrics at times of the training; see `Curve`.
 
     Returns:
         A line of the results: the job and its row's settings; means of the metrics over the test views (None where one
@@ -106,23 +87,24 @@ def run_job(
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     loading = time.perf_counter()
-    scene = scene_of(job, data)
-    watch = Curve(scene, loading) if curve else None
+    scene = scene_of(job, places.data)
+    watch = Curve(scene, loading) if places.curve else None
     if device.type == "cuda":
         gc.collect()  # arrays of the training before it in this process
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     begin = time.perf_counter()
-    train = _train_gsplat if row.preset is None else _train_nexwarp
-    image, facts = train(job, row, scene, device, models, watch)
+    if row.preset is None:
+        image, facts = _train_gsplat(job, row, scene, device, watch)
+    else:
+        image, facts = _train_nexwarp(job, row, scene, device, watch, places.models)
     seconds = facts.pop("end") - begin
     if watch is not None:
         watch.look(lambda: image, last=True)
         facts["curve"] = watch.points
-    views = _compare(job, scene, image, pictures)
+    views = _compare(job, scene, image, places.pictures)
     camera = scene.test[0].camera
-    known = {name: [x for v in views.values() if (x := v[name]) is not None] for name in METRICS}
-    means = {name: statistics.fmean(values) if values else None for name, values in known.items()}
+    means = {name: mean_of_known(view[name] for view in views.values()) for name in METRICS}
     if device.type == "cuda":
         facts["peak_mib"] = round(torch.cuda.max_memory_allocated() / 2**20)
     return {
@@ -146,7 +128,7 @@ def file_name(job: TrainingJob) -> str:
 
 
 def _train_nexwarp(
-    job: TrainingJob, row: Row, scene: Scene, device: torch.device, models: Path | None, watch: Curve | None
+    job: TrainingJob, row: Row, scene: Scene, device: torch.device, watch: Curve | None, models: Path | None
 ) -> tuple[RenderImage, dict[str, Any]]:
     store = StageStore() if watch is None else WatchedStages(watch)
     runner = StageRunner(scene, config_of(job, row), device, store)
@@ -166,7 +148,7 @@ def _train_nexwarp(
 
 
 def _train_gsplat(
-    job: TrainingJob, row: Row, scene: Scene, device: torch.device, _: Path | None, watch: Curve | None
+    job: TrainingJob, row: Row, scene: Scene, device: torch.device, watch: Curve | None
 ) -> tuple[RenderImage, dict[str, Any]]:
     settings = peer_gsplat.PeerSettings(**row.settings)
     look = None if watch is None else lambda gaussians: watch.look(lambda: _gsplat_image(gaussians, device))
