@@ -229,7 +229,7 @@ class Render:
             console.print(f"--path {job.path}, as the cameras {surround} what they look at")
         with display.stages(console) as observe:
             job.render(model, partial(observe, "rendering"))
-        console.print(f"{len(job.pictures)} pictures in {opened.folder / RENDERS_FOLDER}")
+        console.print(f"{len(job.stills) + len(job.frames)} pictures in {opened.folder / RENDERS_FOLDER}")
         if self.pictures.video is not None:
             console.print(f"{job.seconds:.2f} s of video in {self.pictures.video}")
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, cast, get_args
+from typing import Annotated, TypeAlias, cast, get_args
 
 import torch
 
@@ -16,7 +16,7 @@ from nexwarp.cameras.cameras_file import CAMERAS_FILE, WORLD
 from nexwarp.cameras.nerfstudio import load_camera_path
 from nexwarp.cameras.paths import PATHS, suited_path
 from nexwarp.cameras.ray_camera import MAX_SIDE, RayCamera
-from nexwarp.cameras.similarity import IDENTITY, Similarity
+from nexwarp.cameras.similarity import Similarity
 from nexwarp.data.option import Flag_, option
 from nexwarp.errors import RunError, SettingError, naming, require
 from nexwarp.io.pictures import linear_light, png_files, save_exr, to_uint8
@@ -34,15 +34,7 @@ PROJECTIONS = (PINHOLE, PANORAMA, FISHEYE) = ("pinhole", "panorama", "fisheye")
 SETS = {"test": (TEST,), "train": (TRAIN,), "all": (TRAIN, TEST), None: ()}
 LARGEST_SIDE = 16384  # pixels
 
-
-@dataclass(frozen=True)
-class PictureJob:
-    """One image to render."""
-
-    file: Path  # PNG
-    camera: Camera  # a pinhole at the pose, and of the size, of the image
-    is_frame: bool = False  # of the camera path
-    buffers: bool = False  # also write them
+Picture: TypeAlias = tuple[Path, Camera]  # a PNG file; a pinhole at the pose, and of the size, of the image
 
 
 @dataclass(frozen=True)
@@ -103,7 +95,10 @@ class RenderOrder:
         for name, asked in (("order", self.order is not None), ("buffers", self.buffers)):
             pinhole = f"--{name}: expected together with --camera pinhole, got --camera {self.camera}"
             require(self.camera == PINHOLE or not asked, pinhole)
-        self._size()
+        require(0 < self.scale < math.inf, f"--scale: expected a number above 0, got {self.scale:g}")
+        require(self.size is None or self.scale == 1.0, "--size, --scale: expected at most one of them, got both")
+        fits = self.size is None or 1 <= min(self._sides) <= max(self._sides) <= LARGEST_SIDE
+        require(fits, f"--size: expected WIDTHxHEIGHT of 1 to {LARGEST_SIDE} pixels each, got {self.size!r}")
         if self.video is not None:
             with naming("--video"):
                 check_video(self.video, fps)
@@ -121,29 +116,26 @@ class RenderOrder:
     def prepare(self, opened: OpenedModel) -> "RenderJob":
         """Choose the cameras and the files; a model without cameras has no still views."""
         self.check()
-        size = self._size()
-        cameras = opened.cameras
         renders = opened.folder / RENDERS_FOLDER
         if self.camera != PINHOLE:
             renders = renders / self.camera
-        pictures = [
-            PictureJob(renders / group / picture_name(name), size(camera), buffers=self.buffers)
+        stills = [
+            (renders / group / picture_name(name), self._sized(camera))
             for group in SETS[self.views]
-            for name, camera in cameras.get(group, {}).items()
+            for name, camera in opened.cameras.get(group, {}).items()
         ]
+        frames: list[Picture] = []
         fps, name = FPS, None
         if self.has_path and self.frames != 0:
             name = self.path or suited_path(list(opened.path_cameras().get(TRAIN, {}).values()))
             folder, path, fps = self._path(name, opened, renders)
-            first = size(path[0])
-            buffers = self.buffers and self.views is None
-            for index, camera in enumerate(path):
-                camera = resized(size(camera), first.width, first.height)
-                pictures.append(PictureJob(folder / f"{index:04d}.png", camera, True, buffers))
-        if not pictures:
+            first, *others = (self._sized(camera) for camera in path)
+            alike = [first, *(resized(camera, first.width, first.height) for camera in others)]
+            frames = [(folder / f"{index:04d}.png", camera) for index, camera in enumerate(alike)]
+        if not stills and not frames:
             file = opened.folder / CAMERAS_FILE
             raise RunError(f"{file}: expected {self.views} views to render, found none; see --path")
-        return RenderJob(pictures, self, fps if self.fps is None else self.fps, name, opened.frame)
+        return RenderJob(self, stills, frames, fps if self.fps is None else self.fps, name, opened.frame)
 
     def _path(self, name: str, opened: OpenedModel, renders: Path) -> tuple[Path, list[Camera], float]:
         """Return the folder of the frames, their cameras, and the frames per second."""
@@ -168,20 +160,19 @@ class RenderOrder:
             hint = "; --frames 0 renders the still views alone" if self.views is not None else ""
             raise SettingError(f"--path {name}: {error}{hint}") from None
 
-    def _size(self) -> Callable[[Camera], Camera]:
-        """Return the function that resizes a camera's image as --size or --scale specify."""
-        require(0 < self.scale < math.inf, f"--scale: expected a number above 0, got {self.scale:g}")
-        if self.size is None:
-            return self._scaled
-        require(self.scale == 1.0, "--size, --scale: expected at most one of them, got both")
-        match = re.fullmatch(r"(\d+)[xX](\d+)", self.size)
-        width, height = map(int, match.groups()) if match else (0, 0)
-        fits = 1 <= min(width, height) and max(width, height) <= LARGEST_SIDE
-        require(fits, f"--size: expected WIDTHxHEIGHT of 1 to {LARGEST_SIDE} pixels each, got {self.size!r}")
-        return lambda camera: resized(camera, width, height)
+    @property
+    def _sides(self) -> tuple[int, int]:
+        """Width and height of --size, zeros where it has none."""
+        match = re.fullmatch(r"(\d+)[xX](\d+)", self.size or "")
+        return (0, 0) if match is None else (int(match[1]), int(match[2]))
 
-    def _scaled(self, camera: Camera) -> Camera:
-        """Resize an image by --scale; a panorama's pixels are as large as the photos', a fisheye image is a square."""
+    def _sized(self, camera: Camera) -> Camera:
+        """Resize an image as --size or --scale specify.
+
+        By --scale, a panorama's pixels are as large as the photos', and a fisheye image is a square.
+        """
+        if self.size is not None:
+            return resized(camera, *self._sides)
         width = camera.width
         height = camera.height
         if self.camera == PANORAMA:
@@ -199,18 +190,19 @@ class RenderOrder:
 
 @dataclass(frozen=True)
 class RenderJob:
-    """Images to render, in their order, and the video of their frames."""
+    """Still views and frames of a path to render, in this order, and the video of the frames."""
 
-    pictures: list[PictureJob]
     order: RenderOrder
-    fps: float = FPS
-    path: str | None = None  # name of the path, if any
-    frame: Similarity = IDENTITY  # from that of the cameras to the coordinates of the buffers
+    stills: list[Picture]
+    frames: list[Picture]
+    fps: float
+    path: str | None  # name of the path, if any
+    frame: Similarity  # from that of the cameras to the coordinates of the buffers
 
     @property
     def seconds(self) -> float:
         """Duration of the path in seconds."""
-        return sum(picture.is_frame for picture in self.pictures) / self.fps
+        return len(self.frames) / self.fps
 
     @torch.no_grad()
     def render(self, model: Model, progress: Callable[[int, int], object]) -> None:
@@ -218,34 +210,35 @@ class RenderJob:
 
         `progress` is called with the number of images that are done, and their total.
         """
-        frames = [picture for picture in self.pictures if picture.is_frame]
+        pictures, frames = [*self.stills, *self.frames], self.frames
         asked = {"exposure": self.order.exposure, "order": self.order.order}
         changes = cast(RenderChanges, {name: value for name, value in asked.items() if value is not None})
         white = w if isinstance(w := model.meta.get("white"), float) else 1.0
         with ExitStack() as stack:
             append = None
             if self.order.video is not None:  # before any rendering, which would be lost if it cannot be written
-                size = (frames[0].camera.width, frames[0].camera.height)
+                size = (frames[0][1].width, frames[0][1].height)
                 append = stack.enter_context(video_writer(self.order.video, *size, self.fps))
             save = stack.enter_context(png_files())
-            for number, picture in enumerate(self.pictures, 1):
-                if picture.buffers:
-                    buffers = render_buffers(model, picture.camera, **changes)
-                    save_buffers(picture.file.with_suffix(".exr"), moved_buffers(buffers, self.frame))
+            for number, (file, camera) in enumerate(pictures, 1):
+                is_frame = number > len(self.stills)
+                if self.order.buffers and is_frame == (self.order.views is None):
+                    buffers = render_buffers(model, camera, **changes)
+                    save_buffers(file.with_suffix(".exr"), moved_buffers(buffers, self.frame))
                     image = buffers.image
                 else:
-                    image = model.render(projected(self.order, picture.camera), **changes).image
+                    image = model.render(projected(self.order, camera), **changes).image
                 pixels = to_uint8(image).cpu()
                 if self.order.format == "png":
-                    save(picture.file, pixels)
+                    save(file, pixels)
                 else:
                     light = linear_light(image.cpu().clamp_min(0)) * white
-                    save_exr(picture.file.with_suffix(".exr"), {"image": light})
-                if append is not None and picture.is_frame:
+                    save_exr(file.with_suffix(".exr"), {"image": light})
+                if append is not None and is_frame:
                     append(pixels)
-                progress(number, len(self.pictures))
+                progress(number, len(pictures))
         if frames:  # an earlier, longer path may have left others
-            for file in frames[0].file.parent.iterdir():
+            for file in frames[0][0].parent.iterdir():
                 if re.fullmatch(r"\d{4,}\.(png|exr)", file.name) and int(file.stem) >= len(frames):
                     file.unlink()
 
