@@ -13,7 +13,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -34,7 +33,6 @@ FRAMES = 120  # parts of a video, of which each gives a photo
 MAX_STEM = 40  # characters of the scene's name in that of the folder to work in
 
 CHILD = (sys.executable, "-c", "from nexwarp.data.sfm.process import work; work()")
-LAST_LINES = 200  # of what a process writes to stderr, in which the reason of its end is searched
 FULL = re.compile(r"No space left|disk is full|File too large|File size limit|disk I/O error", re.I)
 REASON = re.compile(f"Check failed|what\\(\\):|{FULL.pattern}", re.I)
 FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -112,15 +110,13 @@ def source_identity(source: Path) -> dict[str, Json]:
 
 def _in_child(order: Order, scene: Path, observe: Observer) -> SfmReport:
     """Let a process of its own do the work; return its report, or raise its error."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    variables = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     # A session of its own: Ctrl-C in a terminal reaches this process alone, which then ends the other one.
-    with subprocess.Popen(
-        CHILD, stdin=PIPE, stdout=PIPE, stderr=PIPE, env=environment, start_new_session=True
-    ) as child:
-        assert child.stdin is not None and child.stdout is not None and child.stderr is not None
-        last: deque[bytes] = deque(maxlen=LAST_LINES)
-        listener = threading.Thread(target=last.extend, args=(child.stderr,), daemon=True)
-        listener.start()
+    with (
+        tempfile.TemporaryFile() as words,
+        subprocess.Popen(CHILD, stdin=PIPE, stdout=PIPE, stderr=words, env=variables, start_new_session=True) as child,
+    ):
+        assert child.stdin is not None and child.stdout is not None
         answer: object = None
         try:
             with suppress(BrokenPipeError):
@@ -139,12 +135,13 @@ def _in_child(order: Order, scene: Path, observe: Observer) -> SfmReport:
             child.kill()
             raise
         child.wait()
-        listener.join()
+        words.seek(0)
+        told = words.read().decode(errors="replace")
     if isinstance(answer, SfmReport):
         return answer
     error = answer if isinstance(answer, Exception) else None
     if error is None:
-        error = SceneError(_end_of(order.source, child.returncode, b"".join(last).decode(errors="replace")))
+        error = SceneError(_end_of(order.source, child.returncode, told))
     number = error.errno if isinstance(error, OSError) else None
     if PYCOLMAP in str(error):  # it seldom tells why
         number = errno.ENOSPC if FULL.search(str(error)) else _write_fault(order.folder)

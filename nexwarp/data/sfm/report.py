@@ -7,7 +7,7 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
-from nexwarp.data.capture import short
+from nexwarp.data.capture import listed, short
 from nexwarp.data.sfm.frames import FrameChoice
 
 Cameras = Literal["auto", "single", "folder", "image"]
@@ -145,8 +145,7 @@ class SfmReport:
         lines = []
         for reason in list(dict.fromkeys(self.skipped.values())):
             names = [short(name) for name in self.skipped if self.skipped[name] == reason]
-            more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
-            lines.append(f"skipped {len(names)}: {', '.join(names[:LISTED])}{more}: {reason}")
+            lines.append(f"skipped {len(names)}: {listed(names, LISTED)}: {reason}")
         names = list(self.left_out)
         lines += [f"left out: {name}: {self.left_out[name]}" for name in names[:LISTED]]
         if len(names) > LISTED:
@@ -218,7 +217,6 @@ def components(nodes: Iterable[str], edges: Iterable[tuple[str, str]]) -> list[s
         if group[one] is not group[other]:
             small, large = sorted((group[one], group[other]), key=len)
             large |= small
-            for node in small:
-                group[node] = large
+            group |= dict.fromkeys(small, large)
     unique = {id(members): members for members in group.values()}.values()
     return sorted(unique, key=lambda members: (-len(members), min(members)))
