@@ -86,23 +86,16 @@ def _look(view: View, points: torch.Tensor, cloud: torch.Tensor) -> tuple[torch.
     from scipy.spatial import cKDTree
 
     camera = view.camera
-    shown, pixels = _shown(view, points)
-    column, row = pixels.long().unbind(1)
+    pixels, depths = camera.project(points.float())
+    shown = in_image(pixels, depths, camera.width, camera.height).nonzero()[:, 0]
+    column, row = pixels[shown].long().unbind(1)
+    if view.mask is not None:
+        used = view.mask[row, column]
+        shown, column, row = shown[used], column[used], row[used]
     around, depths = camera.project(cloud.float())
     around = around[in_image(around, depths, camera.width, camera.height)]
     # Balancing the tree would take longer than the few searches.
     tree = cKDTree(around.numpy(), compact_nodes=False, balanced_tree=False)
     gap = GAP * math.hypot(camera.width, camera.height)
-    nearest, _ = tree.query(pixels.numpy(), distance_upper_bound=gap)  # infinite beyond it
+    nearest, _ = tree.query(pixels[shown].numpy(), distance_upper_bound=gap)  # infinite beyond it
     return shown, view.image[row, column].double() / 255, torch.from_numpy(np.isinf(nearest))
-
-
-def _shown(view: View, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the indices (M,) of the points (N, 3) that a view shows, and their pixels (M, 2)."""
-    camera = view.camera
-    pixels, depths = camera.project(points.float())
-    shown = in_image(pixels, depths, camera.width, camera.height).nonzero()[:, 0]
-    if view.mask is not None:
-        column, row = pixels[shown].long().unbind(1)
-        shown = shown[view.mask[row, column]]
-    return shown, pixels[shown]
