@@ -111,13 +111,6 @@ def pack_matrices(
     packed[i] = wp.float16(value)
 
 
-@wp.kernel(enable_backward=False, module="unique")
-def order_gradients(first: int, sums: Real, order: Word, unscale: Real, gradients: Real):
-    """Put the matrices' gradients into the order of the matrices' values."""
-    i = first + wp.tid()
-    gradients[i] = sums[order[i]] * unscale[0]
-
-
 @functools.cache
 def fused_kernels(features: int) -> SimpleNamespace:
     """Make the kernels of the forward pass and of the backward pass down to the features, for F = 2 or 4.

@@ -15,7 +15,6 @@ from nexwarp.kernels.fused_texture import (
     FORWARD_BLOCKS,
     FORWARD_THREADS,
     fused_kernels,
-    order_gradients,
     pack_matrices,
 )
 from nexwarp.kernels.tiles import LARGEST_INT
@@ -152,9 +151,8 @@ def _mlp_backward(
     kernel = fused_kernels(features).backward
     launch(table, kernel, threads, [threads, arguments, fused["colors"]], [], block_dim=BACKWARD_THREADS)
     order = _order(features, len(weights[-1]), table.device)
-    flat = unscale.new_empty(len(order))
-    launch(table, order_gradients, len(order), [slots.sum(0), order, unscale], [flat])
-    parts = flat.split([matrix.numel() for matrix in weights])
+    gradients = slots.sum(0).index_select(0, order) * unscale
+    parts = gradients.split([matrix.numel() for matrix in weights])
     return [part.view_as(matrix) for part, matrix in zip(parts, weights, strict=True)]
 
 
