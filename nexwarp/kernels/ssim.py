@@ -73,6 +73,7 @@ _SPREAD = f"""
     return sums;
 """
 Sums = wp.types.vector(length=ROWS, dtype=wp.float32)
+Planes = wp.types.matrix(shape=(MOMENTS, ROWS), dtype=wp.float32)
 
 
 @wp.func_native(_SPREAD)
@@ -82,6 +83,14 @@ def spread(i: wp.int32, x: wp.float32, sums: Sums) -> Sums:
     i is a constant, so that the weights are, too.
     """
     ...
+
+
+@wp.func
+def spread_all(i: wp.int32, values: wp.vec4, planes: Planes):
+    """`spread` each of four values to its plane."""
+    for k in range(wp.static(MOMENTS)):
+        planes[k] = spread(i, values[k], planes[k])
+    return planes
 
 
 @wp.func_native(_CELL)
@@ -110,6 +119,37 @@ def place(thread: int, width: int):
     block = thread // THREADS
     strips = (width + COLUMNS - 1) // COLUMNS
     return wp.vec3i(thread % THREADS, (block % strips) * COLUMNS, (block // strips) * ROWS)
+
+
+@wp.func
+def blurred_moments(image: reals, target: reals, column: int, top: int, height: int, width: int):
+    """Blurs down a column of x, y, (x^2 + y^2) / 2 and x y, in the rows from `top`."""
+    sums = Planes()
+    if column >= 0 and column < width:
+        for i in range(wp.static(READ)):
+            row = top + i - REACH
+            x = float(0.0)
+            y = float(0.0)
+            if row >= 0 and row < height:
+                x = clamped(image[row * width + column])
+                y = target[row * width + column]
+            sums = spread_all(i, wp.vec4(x, y, 0.5 * (x * x + y * y), x * y), sums)
+    return sums
+
+
+@wp.func
+def blurred_slopes(derivatives: real_rows, column: int, top: int, height: int, width: int):
+    """Blurs down a column of the three derivatives, likewise; the fourth plane is unused."""
+    sums = Planes()
+    if column >= 0 and column < width:
+        for i in range(wp.static(READ)):
+            row = top + i - REACH
+            values = wp.vec4()
+            if row >= 0 and row < height:
+                for k in range(3):
+                    values[k] = derivatives[k, row * width + column]
+            sums = spread_all(i, values, sums)
+    return sums
 
 
 @wp.func
@@ -199,43 +239,20 @@ def score(
     thread = first + wp.tid()
     at = place(thread, width)
     lane = at[0]
-    column = at[1] - 3 * REACH + lane
-    mx = Sums()
-    my = Sums()
-    q = Sums()
-    p = Sums()
-    if column >= 0 and column < width:
-        for i in range(wp.static(READ)):
-            row = at[2] + i - REACH
-            x = float(0.0)
-            y = float(0.0)
-            if row >= 0 and row < height:
-                x = clamped(image[row * width + column])
-                y = target[row * width + column]
-            mx = spread(i, x, mx)
-            my = spread(i, y, my)
-            q = spread(i, 0.5 * (x * x + y * y), q)
-            p = spread(i, x * y, p)
-    put(0, lane, mx)
-    put(1, lane, my)
-    put(2, lane, q)
-    put(3, lane, p)
+    moments = blurred_moments(image, target, at[1] - 3 * REACH + lane, at[2], height, width)
+    for k in range(wp.static(MOMENTS)):
+        put(k, lane, moments[k])
     sync_block()
     total = float(0.0)
-    ds_dmx = Sums()
-    ds_dq = Sums()
-    ds_dp = Sums()
+    slopes = Planes()
     if lane < COLUMNS:
-        gx = blur(0, lane)
-        gy = blur(1, lane)
-        gq = blur(2, lane)
-        gp = blur(3, lane)
+        for k in range(wp.static(MOMENTS)):
+            moments[k] = blur(k, lane)
         row = at[2] + lane // wp.static(COLUMNS // GROUP)
         for o in range(wp.static(GROUP)):
-            s = ssim(gx[o], gy[o], gq[o], gp[o])
-            ds_dmx[o] = s[1]
-            ds_dq[o] = s[2]
-            ds_dp[o] = s[3]
+            s = ssim(moments[0, o], moments[1, o], moments[2, o], moments[3, o])
+            for k in range(3):
+                slopes[k, o] = s[k + 1]
             if row < height and at[1] + group_column(lane) + 3 * o < width:
                 total += (1.0 - s[0]) * scale
     total = warp_sum(total)
@@ -245,9 +262,8 @@ def score(
         return
     sync_block()
     if lane < COLUMNS:
-        put_group(0, lane, ds_dmx)
-        put_group(1, lane, ds_dq)
-        put_group(2, lane, ds_dp)
+        for k in range(3):
+            put_group(k, lane, slopes[k])
     sync_block()
     write_columns(derivatives, lane, at[1] + lane, at[2], height, width)
 
@@ -267,39 +283,17 @@ def gradient(  # noqa: PLR0913  # a kernel entry point
 ):
     at = place(first + wp.tid(), width)
     lane = at[0]
-    column = at[1] - 3 * REACH + lane
-    dmx = Sums()
-    dq = Sums()
-    dp = Sums()
-    if column >= 0 and column < width:
-        for i in range(wp.static(READ)):
-            row = at[2] + i - REACH
-            x = float(0.0)
-            y = float(0.0)
-            z = float(0.0)
-            if row >= 0 and row < height:
-                x = derivatives[0, row * width + column]
-                y = derivatives[1, row * width + column]
-                z = derivatives[2, row * width + column]
-            dmx = spread(i, x, dmx)
-            dq = spread(i, y, dq)
-            dp = spread(i, z, dp)
-    put(0, lane, dmx)
-    put(1, lane, dq)
-    put(2, lane, dp)
-    sync_block()
-    gmx = Sums()
-    gq = Sums()
-    gp = Sums()
-    if lane < COLUMNS:
-        gmx = blur(0, lane)
-        gq = blur(1, lane)
-        gp = blur(2, lane)
+    slopes = blurred_slopes(derivatives, at[1] - 3 * REACH + lane, at[2], height, width)
+    for k in range(3):
+        put(k, lane, slopes[k])
     sync_block()
     if lane < COLUMNS:
-        put_group(0, lane, gmx)
-        put_group(1, lane, gq)
-        put_group(2, lane, gp)
+        for k in range(3):
+            slopes[k] = blur(k, lane)
+    sync_block()
+    if lane < COLUMNS:
+        for k in range(3):
+            put_group(k, lane, slopes[k])
     sync_block()
     column = at[1] + lane
     if lane < COLUMNS and column < width:
