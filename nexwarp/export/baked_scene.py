@@ -69,17 +69,12 @@ class BakedScene:
 
     def to(self, device: torch.device | str) -> "BakedScene":
         """Return the scene on a device."""
-        sh, limits, exposures = self.harmonics, self.limits, self.exposures
-        return dataclasses.replace(
-            self,
-            shape=Activated(*(x.to(device) for x in self.shape)),
-            texels=self.texels.to(device),
-            boxes=self.boxes.to(device),
-            rects=self.rects.to(device),
-            harmonics=None if sh is None else (sh[0].to(device), sh[1].to(device)),
-            limits=None if limits is None else limits.to(device),
-            exposures=None if exposures is None else exposures.to(device),
-        )
+        parts = {name: getattr(self, name) for name in ("texels", "boxes", "rects", "limits", "exposures")}
+        moved: dict[str, Any] = {name: x.to(device) for name, x in parts.items() if x is not None}
+        moved["shape"] = Activated(*(x.to(device) for x in self.shape))
+        if self.harmonics is not None:
+            moved["harmonics"] = tuple(x.to(device) for x in self.harmonics)
+        return dataclasses.replace(self, **moved)
 
     def render(self, camera: Camera, *, background: Color | None = None) -> torch.Tensor:
         """Render the scene on its device; differentiable in texels, harmonics and opacities.

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera
-from nexwarp.io.pictures import viridis
+from nexwarp.io.pictures import to_uint8, viridis
 from nexwarp.kernels.types import MAX_HITS, MAX_SH_DEGREE
 from nexwarp.model.model import Model
 from nexwarp.model.options import Exposure
@@ -115,7 +115,7 @@ def _pixels(values: torch.Tensor, span: tuple[float, float] | None) -> np.ndarra
         table = viridis().to(values.device)
         steps = ((values - span[0]) / (span[1] - span[0]) * (len(table) - 1)).nan_to_num().round()
         values = table[steps.clamp(0, len(table) - 1).long()] * ~values.isnan()[..., None]
-    return (values.nan_to_num().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
+    return to_uint8(values.nan_to_num()).cpu().numpy()
 
 
 def _depth_span(depths: torch.Tensor) -> tuple[float, float]:

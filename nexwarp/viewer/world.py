@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -106,20 +106,17 @@ class Viewpoint:
         width, height = max(round(self.width * scale), 1), max(round(self.height * scale), 1)
         focal = 0.5 * height / math.tan(0.5 * self.fov)
         viewmat = torch.from_numpy(np.linalg.inv(self.pose)).to(like)
+        K = like.new_tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        camera = LimitedCamera(viewmat, K, width, height, near, focal_limit=focal_limit)
         rows = -(-height // (BAND_ROWS * count)) * BAND_ROWS
-        cameras: list[Camera] = []
-        for top in range(0, height, rows):
-            K = like.new_tensor([[focal, 0, width / 2], [0, focal, height / 2 - top], [0, 0, 1]])
-            cameras.append(LimitedCamera(viewmat, K, width, min(rows, height - top), near, focal_limit=focal_limit))
-        return cameras
+        return [camera.crop(0, top, width, min(rows, height - top)) for top in range(0, height, rows)]
 
 
+@dataclass(frozen=True)
 class LimitedCamera(Camera):
     """A camera with an upper limit, in pixels, on the focal length by which the texture's levels are weighted."""
 
-    def __init__(self, *arguments: Any, focal_limit: float = math.inf, **others: Any) -> None:
-        super().__init__(*arguments, **others)
-        self.focal_limit = focal_limit
+    focal_limit: float = field(default=math.inf, kw_only=True)
 
     @property
     def focal(self) -> float:
