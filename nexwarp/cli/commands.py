@@ -23,7 +23,7 @@ from nexwarp.data.sfm import SfmOptions, process
 from nexwarp.data.sfm.photos import FILMS, OTHERS, SUFFIXES
 from nexwarp.data.sfm.process import FRAMES, REPORT_FILE, source_identity
 from nexwarp.errors import FormatError, MissingError, RunError, SceneError
-from nexwarp.io.json_files import READ_ERRORS, Json, read_object, write_json
+from nexwarp.io.json_files import READ_ERRORS, Json, finite, read_object, write_json
 from nexwarp.model.edit import write_edits
 from nexwarp.model.model import Model
 from nexwarp.model.texture import NeuralTexture
@@ -43,7 +43,7 @@ from nexwarp.run.folder import (
     read_metrics,
 )
 from nexwarp.run.render import RenderOrder
-from nexwarp.train.recipe import MASK_MODES
+from nexwarp.train.recipe import DEFAULT
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer
@@ -158,8 +158,7 @@ class Eval:
                 with display.stages(console) as observe:
                     views, moves = fit_poses(model, views, progress=partial(observe, "fitting test poses"))
                 facts["test_poses"] = {**moves}
-            mask_mode = MASK_MODES[0] if opened.config is None else opened.config.mask_mode
-            options = {"mask_mode": mask_mode, "metrics": self.metrics}
+            options = {"mask_mode": (opened.config or DEFAULT).mask_mode, "metrics": self.metrics}
             results = evaluate_run(model, views, opened.folder, console, facts, **options)
         rows = figures(results, self.metrics)
         fitted = ", poses fitted to their photos" if self.refine_poses else ""
@@ -192,15 +191,8 @@ def evaluate_run(
         progress = partial(observe, "evaluating")
         results = evaluate(model, views, renders=run / RENDERS_FOLDER, progress=progress, **options)
     entries = facts | cast(dict[str, Json], results)
-    write_json(run / METRICS_FILE, _finite(entries))
+    write_json(run / METRICS_FILE, finite(entries))
     return entries
-
-
-def _finite(value: Json) -> Json:
-    """Return JSON with null for infinity, which JSON does not have: the PSNR of equal pictures."""
-    if isinstance(value, dict):
-        return {name: _finite(inner) for name, inner in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @dataclass

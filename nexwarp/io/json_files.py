@@ -2,6 +2,7 @@
 
 import codecs
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any, NoReturn, TypeAlias, Union
@@ -30,6 +31,13 @@ OTHERS = bytes(set(range(256)) - set(b"[{]}"))
 def write_json(path: Path, data: object) -> None:
     """Write indented JSON atomically; ValueError for NaN and infinity, which JSON does not have."""
     write_atomically(path, (json.dumps(data, indent=2, allow_nan=False) + "\n").encode())
+
+
+def finite(value: Json) -> Json:
+    """Return a value with null for NaN and infinity, which JSON does not have, such as the PSNR of equal pictures."""
+    if isinstance(value, dict):
+        return {name: finite(inner) for name, inner in value.items()}
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def read_json(path: Path, *, finite: bool = False) -> Any:

@@ -314,8 +314,7 @@ def _photos(opened: OpenedModel, device: Device, observe: Progress) -> Scene | N
     except (OSError, ValueError, MemoryError) as error:
         warnings.warn(f"the photos cannot be read ({one_line(error)}), so nothing is fitted to them", stacklevel=2)
         return None
-    mode = MASK_MODES[0] if opened.config is None else opened.config.mask_mode
-    groups = []
+    mode, groups = (opened.config or DEFAULT).mask_mode, []
     for views in (scene.train, scene.test):
         shown = [(view, *compared(opened.model, view, mode)) for view in views]
         groups.append([replace(view, image=image, mask=mask) for view, image, mask in shown])

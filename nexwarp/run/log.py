@@ -12,7 +12,7 @@ from typing import Any, TextIO
 import torch
 
 from nexwarp.io.files import written_aside
-from nexwarp.io.json_files import Json
+from nexwarp.io.json_files import Json, finite
 from nexwarp.run.folder import LOG_FILE, TENSORBOARD_FOLDER
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
@@ -66,7 +66,7 @@ class TrainingLog:
         if (step.iteration - 1) % self.every >= step.views and step.iteration != self.trainer.config.iterations:
             return
         assert self.file is not None
-        line = self._line(step)
+        line = {name: finite(value) for name, value in self._line(step).items()}
         self.file.write(json.dumps(line, allow_nan=False) + "\n")
         self.file.flush()
         if self.events is not None:
@@ -85,14 +85,14 @@ class TrainingLog:
         groups = self.trainer.optimizer.param_groups
         return {
             "iteration": step.iteration,
-            "loss": _finite(sum(terms)),
-            "losses": {name: _finite(value) for name, value in zip(step.losses, terms, strict=True)},
-            "psnr": _finite(psnr),
+            "loss": sum(terms),
+            "losses": dict(zip(step.losses, terms, strict=True)),
+            "psnr": psnr,
             "surfels": step.surfels,
             "iterations_per_second": rate,
             "seconds": self.trainer.seconds,
             "memory_bytes": peak_memory(self.trainer.device),
-            "rates": {re.sub("^(raw|log|logit)_", "", group["name"]): _finite(float(group["lr"])) for group in groups},
+            "rates": {re.sub("^(raw|log|logit)_", "", group["name"]): float(group["lr"]) for group in groups},
         }
 
 
@@ -136,10 +136,6 @@ def _iteration(line: bytes) -> float:
     except (ValueError, TypeError, KeyError, RecursionError):  # bad UTF-8 is a ValueError
         return math.inf
     return iteration if type(iteration) is int else math.inf
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _scalars(line: Mapping[str, Json]) -> dict[str, float]:
