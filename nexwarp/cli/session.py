@@ -46,7 +46,6 @@ from nexwarp.train.checkpoint import delete_checkpoints, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.report import StepReport
 from nexwarp.train.stages import VIEW_COST, Stage, StageStore, divide
-from nexwarp.train.target import with_cameras
 from nexwarp.train.trainer import Trainer
 
 if TYPE_CHECKING:
@@ -260,7 +259,7 @@ class Session(StageStore):
     @torch.no_grad()
     def _judged_photos(self, trainer: Trainer, model: Model) -> dict[str, Values]:
         """Return the PSNR of the training photos; all ranks render a share."""
-        views = with_cameras(trainer.scene.train, trainer.views.refined_cameras(trainer.poses))
+        views = trainer.views.refined(trainer.poses)
         mode, ranks = trainer.config.mask_mode, self.ranks
         with display.stages(self.console) as observe:
             told = partial(observe, "judging photos")

@@ -26,35 +26,30 @@ from nexwarp.model.model import Model
 from nexwarp.model.surfels import Surfels, harmonics
 from nexwarp.model.texture import NEVER, DetailLimits
 from nexwarp.train.recipe import Config
-from nexwarp.train.target import with_cameras
 
 SOLVED = 2**21  # values of the matrices solved at once, several times
 LEAST = 1e-6  # least sum of weights over all views, in pixels, of a surfel that is seen
 FinishObserver = Callable[[str, int, int], None]
+Progress = Callable[[int, int], object]  # is told how many views are rendered, and of how many
 
 
 def finish_model(
-    model: Model,
-    views: Sequence[View],
-    cameras: Sequence[Camera],
-    exposures: Exposures | None,
-    config: Config,
-    observe: FinishObserver = lambda *_: None,
+    model: Model, views: Sequence[View], exposures: Exposures | None, config: Config, observe: FinishObserver
 ) -> Model:
     """Return a finished model with surfels of its own: smooth SH, detail limits and exposures.
 
-    The texture is shared. `cameras` are those of the training views as their poses are corrected, on the model's
-    device. `observe` is called with each stage's name, how many views of it are rendered, and of how many.
+    The texture is shared. The cameras of the training views are those whose poses are corrected. `observe` is called
+    with each stage's name, how many views of it are rendered, and of how many.
     """
     raw = {name: value.detach().clone() for name, value in model.surfels.state_dict().items()}
     finished = Model(Surfels(raw), model.texture, options=model.options)
     if config.smooth_sh > 0:
         # Detail limits are the same whatever the order of threads.
         with deterministic(config.deterministic and model.device.type == "cuda"):
-            seen_from = with_cameras(views, cameras)
-            sh0, shN = smooth_sh(finished, seen_from, config.smooth_sh, partial(observe, "smoothing SH"))
+            sh0, shN = smooth_sh(finished, views, config.smooth_sh, partial(observe, "smoothing SH"))
         finished.surfels.sh0.data, finished.surfels.shN.data = sh0, shN
     if config.footprints:
+        cameras = [view.camera for view in views]
         finished.detail_limits = measure_detail_limits(finished, cameras, partial(observe, "measuring detail limits"))
     if exposures is not None:
         finished.exposures = copy.deepcopy(exposures).to(model.device)
@@ -64,7 +59,7 @@ def finish_model(
 
 @torch.no_grad()
 def measure_detail_limits(
-    model: Model, cameras: Sequence[Camera], progress: Callable[[int, int], object] = lambda *_: None
+    model: Model, cameras: Sequence[Camera], progress: Progress = lambda *_: None
 ) -> DetailLimits:
     """Return the detail limits of a model's surfels: the pixel sizes (depth / focal) at which cameras saw them."""
     bare = model.bare(max_hits=max(model.options.max_hits, 1))
@@ -91,7 +86,7 @@ def measure_detail_limits(
 
 @torch.no_grad()
 def smooth_sh(
-    model: Model, views: Sequence[View], strength: float, progress: Callable[[int, int], object] = lambda _, __: None
+    model: Model, views: Sequence[View], strength: float, progress: Progress = lambda *_: None
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return smoothed coefficients `sh0` (N, 1, 3) and `shN` (N, C - 1, 3); masked pixels do not count.
 
@@ -130,7 +125,7 @@ def _smooth(coefficients: torch.Tensor, ids: torch.Tensor, equations: torch.Tens
 
 @torch.no_grad()
 def seen_directions(
-    model: Model, views: Sequence[View], progress: Callable[[int, int], object] = lambda _, __: None
+    model: Model, views: Sequence[View], progress: Progress = lambda *_: None
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the normal equations of the N surfels: sum_v w_v Y_i(d_v) Y_j(d_v), (N, P), and sum_v w_v, (N,).
 

@@ -304,6 +304,10 @@ class TrainingViews:
         """Return the cameras on the device, with the poses as they are corrected; None corrects none."""
         return self.cameras if poses is None else poses.cameras(self.cameras)
 
+    def refined(self, poses: PoseCorrections | None) -> list[View]:
+        """Return the views with these cameras, as finishing and evaluation take them."""
+        return with_cameras(self.views, self.refined_cameras(poses))
+
     def torch_threads(self, max_hits: int) -> int:
         """Return how many threads to give torch's own loops: on small images, to wake a second one takes longer."""
         all_threads, camera = torch.get_num_threads(), self.cameras[0]

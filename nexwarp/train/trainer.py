@@ -212,8 +212,8 @@ class Trainer(TrainingState):
             self.graphs.clear()  # frees their memory; later steps are captured anew
         self.texture.drop_half_copy()
         with torch.autocast(self.device.type, enabled=False):
-            cameras = self.views.refined_cameras(self.poses)
-            return finish_model(self.model(), self.scene.train, cameras, self.exposures, self.config, observe)
+            views = self.views.refined(self.poses)
+            return finish_model(self.model(), views, self.exposures, self.config, observe)
 
     def check(self) -> None:
         """Raise DivergedError unless all losses since the last check, parameters and optimizer state are finite."""
