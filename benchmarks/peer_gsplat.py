@@ -249,7 +249,7 @@ def _initial(
     extent = 1.1 * float((train - train.mean(0)).norm(dim=1).max())
     points, colors = scene.points, scene.colors.float() / 255 if calibration is None else calibration.colors
     if settings.even_start:
-        start = starting_points(scene, max(count // 2, 1), colors, skybox=settings.skybox)
+        start = starting_points(scene, Config(max_surfels=count, skybox=settings.skybox), colors)
         points, colors = start.means, start.colors
     elif len(points) > count:
         chosen = torch.randperm(len(points))[:count]

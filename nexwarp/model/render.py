@@ -301,13 +301,9 @@ def _texels(frame: Frame, texture: Texture, hits: ops.Hits, limits: DetailLimits
 
 
 def jitter_factors(
-    camera: Camera,
-    max_hits: int,
-    jitter: float,
-    dtype: torch.dtype = torch.float32,
-    generator: torch.Generator | None = None,
+    camera: Camera, max_hits: int, jitter: float, generator: torch.Generator | None = None
 ) -> torch.Tensor:
     """Draw factors (H, W, K) on depths, N(1, jitter / focal), which shift the texture's points along their rays."""
     shape = (camera.height, camera.width, max_hits)
-    factors = torch.empty(shape, dtype=dtype, device=camera.device)
+    factors = torch.empty(shape, dtype=camera.viewmat.dtype, device=camera.device)
     return factors.normal_(1.0, jitter / camera.focal, generator=generator)

@@ -23,7 +23,6 @@ from nexwarp.train.recipe import Config
 
 INITIAL_OPACITY = 0.1
 NUMBERS_A_PIXEL = 0.1  # of the hash grid, for each pixel of the training photos
-USUAL_SCALE = 5.0  # world units; fox, saharov and kitchen25 have 4.4 to 5.0 as COLMAP left them
 SKYBOX_SHARE = 6  # at most one initial surfel of so many lies on the sphere
 SAME_SCALE = 1e-3  # relative difference of the scales of one scene
 TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the paper's
@@ -110,9 +109,8 @@ def initial_texture(scene: Scene, config: Config, surfels: Surfels, start: Start
 def initial_surfels(
     scene: Scene, config: Config, generator: torch.Generator, colors: torch.Tensor | None = None
 ) -> Surfels:
-    """Surfels on the `starting_points`, of `colors` (P, 3) or the scene's: half the budget at most (paper Sec. 4.3)."""
-    most = max(config.max_surfels // 2, 1)
-    points = starting_points(scene, most, colors, skybox=config.skybox, filter_outliers=config.filter_points)
+    """Surfels on the `starting_points`, of `colors` (P, 3) or the scene's."""
+    points = starting_points(scene, config, colors)
     count = len(points.means)
     quats = torch.randn(count, 4, generator=generator)
     raw = {
@@ -127,21 +125,15 @@ def initial_surfels(
     return Surfels(raw)
 
 
-def starting_points(
-    scene: Scene,
-    most: int,
-    colors: torch.Tensor | None = None,
-    *,
-    skybox: int = 0,
-    filter_outliers: bool = True,
-) -> InitialPoints:
-    """Choose `most` points of the cloud by farthest point sampling, and of a sphere around the scene, those last.
+def starting_points(scene: Scene, config: Config, colors: torch.Tensor | None = None) -> InitialPoints:
+    """Choose points of the cloud by farthest point sampling, and of a sphere around the scene, those last.
 
-    Of the sphere's `skybox` points, those near the cloud are left out. They are a sixth of `most` at the most, and none
-    where photos are transparent.
+    They are half the budget at most (paper Sec. 4.3). Of the sphere's points, those near the cloud are left out; a
+    sixth of all may lie on it, and none where photos are transparent.
     """
+    most = max(config.max_surfels // 2, 1)
     # Behind transparent photos lies the background colour alone.
-    count = 0 if scene.background is not None else min(skybox, most // SKYBOX_SHARE)
+    count = 0 if scene.background is not None else min(config.skybox, most // SKYBOX_SHARE)
     sky = skybox_points(scene.train, scene.points, count) if count else None
     points = initial_points(
         scene.points,
@@ -149,7 +141,7 @@ def starting_points(
         most if sky is None else most - len(sky.means),
         track_lengths=scene.track_lengths,
         errors=scene.reprojection_errors,
-        filter_outliers=filter_outliers,
+        filter_outliers=config.filter_points,
     )
     return points if sky is None else points.joined(sky)
 
@@ -196,14 +188,6 @@ def texture_shape(scene: Scene, config: Config) -> TextureShape:
         asked, table_size=entries, min_resolution=coarsest, max_resolution=finest, sh_degree=degree
     )
     return cast(TextureShape, dataclasses.asdict(shape))
-
-
-def cells_unit(scene: Scene, config: Config) -> float:
-    """World units in which the grid's loss counts its cells: a scene's own where the grid follows the scene.
-
-    Scenes of `USUAL_SCALE` keep the loss as the paper has it.
-    """
-    return scene.scale / USUAL_SCALE if config.texture.max_resolution is None else 1.0
 
 
 def _table_size(scene: Scene, width: int) -> int:

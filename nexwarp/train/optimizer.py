@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from nexwarp.data import Scene
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import PARAMETERS, Surfels
 from nexwarp.model.texture import NeuralTexture, Texture
@@ -19,6 +20,7 @@ from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config, LossWeights
 # texture of one's own) and, where they are learned, "poses"; `lr`, the learning rate of the first step.
 ParameterGroup = dict[str, Any]
 EPSILON = 1e-15  # the paper's
+USUAL_SCALE = 5.0  # world units; fox, saharov and kitchen25 have 4.4 to 5.0 as COLMAP left them
 RATED = (*PARAMETERS, "grid", "mlp")  # the groups of the fields of `LearningRates`, in their order
 # First and last learning rates of pose corrections, radians and scene scales, in a run of 30,000 steps.
 POSE_RATES = (2e-4, 2e-6)
@@ -105,20 +107,22 @@ def grid_factors(texture: NeuralTexture, weights: LossWeights, cells_unit: float
     return weights.grid / (texture.resolutions * cells_unit) ** 3 if weights.grid > 0 else None
 
 
+def cells_unit(scene: Scene, config: Config) -> float:
+    """World units in which the grid's loss counts its cells: a scene's own where the grid follows the scene.
+
+    Scenes of `USUAL_SCALE` keep the loss as the paper has it.
+    """
+    return scene.scale / USUAL_SCALE if config.texture.max_resolution is None else 1.0
+
+
 def make_optimizer(
-    surfels: Surfels,
-    texture: Texture,
-    config: Config,
-    scale: float,
-    cells_unit: float = 1.0,
-    poses: PoseCorrections | None = None,
+    surfels: Surfels, texture: Texture, poses: PoseCorrections | None, scene: Scene, config: Config
 ) -> FusedAdam:
     """Make the optimizer of surfels, of the texture unless K is 0, and of pose corrections; it regularises the grid.
 
-    Each of its groups gets the ends of its schedule as `group["ends"]`. The means' rates follow the scene's scale,
-    world units; `cells_unit` are the world units in which the grid's loss counts its cells.
+    Each of its groups gets the ends of its schedule as `group["ends"]`.
     """
-    ends = rate_ends(config, scale)
+    ends = rate_ends(config, scene.scale)
     parts = {name: [getattr(surfels, name)] for name in PARAMETERS}
     rest = {name: x for name, x in texture.named_parameters() if x.requires_grad}
     if isinstance(texture, NeuralTexture):
@@ -136,7 +140,7 @@ def make_optimizer(
         groups = [group | {"lr": torch.tensor(group["lr"], device=surfels.device)} for group in groups]
     optimizer = FusedAdam(groups, eps=EPSILON)
     if isinstance(texture, NeuralTexture) and config.max_hits:
-        optimizer.regularise(texture, grid_factors(texture, config.losses, cells_unit))
+        optimizer.regularise(texture, grid_factors(texture, config.losses, cells_unit(scene, config)))
     return optimizer
 
 

@@ -19,7 +19,7 @@ from nexwarp.model.texture import NeuralTexture, Texture
 from nexwarp.ops.tiles import Order
 from nexwarp.train.checkpoint import Snapshot
 from nexwarp.train.densify import DensityControl
-from nexwarp.train.initial import Start, cells_unit, given_surfels, initial_poses, initial_surfels, initial_texture
+from nexwarp.train.initial import Start, given_surfels, initial_poses, initial_surfels, initial_texture
 from nexwarp.train.optimizer import FusedAdam, make_optimizer
 from nexwarp.train.recipe import Config, config_from_dict, refuse_removed
 
@@ -45,18 +45,12 @@ class TrainingState:
     background: tuple[float, float, float]
 
     def __init__(
-        self,
-        scene: Scene,
-        config: Config,
-        device: torch.device,
-        colors: torch.Tensor | None = None,
-        start: Start | None = None,
+        self, scene: Scene, config: Config, device: torch.device, colors: torch.Tensor | None, start: Start
     ) -> None:
         """Make the initial surfels, of the points' `colors` (P, 3) or else the scene's own, and the texture.
 
         `start` has those that are given instead.
         """
-        start = start or {}
         self.scene = scene
         self.config = config
         self.device = device
@@ -65,7 +59,6 @@ class TrainingState:
         surfels = given_surfels(config, start) or initial_surfels(scene, config, self.generator, colors)
         self._surfels = surfels.to(device)
         self._texture = initial_texture(scene, config, surfels, start).to(device)
-        self.cells_unit = cells_unit(scene, config)
         self.poses = initial_poses(scene, config, device)
         self.optimizer = self._make_optimizer()
         self.densifier = DensityControl(self.surfels, config)
@@ -85,7 +78,7 @@ class TrainingState:
         return self._texture
 
     def _make_optimizer(self) -> FusedAdam:
-        return make_optimizer(self.surfels, self.texture, self.config, self.scene.scale, self.cells_unit, self.poses)
+        return make_optimizer(self.surfels, self.texture, self.poses, self.scene, self.config)
 
     def _parts(self) -> dict[str, torch.nn.Module]:
         """Return what is trained, by the first words of the names in a checkpoint."""

@@ -46,7 +46,7 @@ def test_jitter_moves_lookups_along_their_rays(jitter, device, monkeypatch):
     monkeypatch.setattr(nw.NeuralTexture, "evaluate", spy)
     still, camera = draw(scene, texture), make_camera(scene)
     generator = torch.Generator(device).manual_seed(3)
-    factors = jitter_factors(camera, 2, jitter, scene["means"].dtype, generator)
+    factors = jitter_factors(camera, 2, jitter, generator)
     moved = draw(scene, texture, jitter=factors)
     assert_same(moved, still, ("plain", "depths", "weights", "alpha"))
     assert torch.equal(moved.ids, still.ids)
@@ -60,7 +60,7 @@ def test_jitter_moves_lookups_along_their_rays(jitter, device, monkeypatch):
     assert abs(pixels.mean().item()) < error * jitter and abs(pixels.std().item() - jitter) < error * jitter
     assert not torch.equal(moved.textured, still.textured)
     assert_same(draw(scene, texture, jitter=factors), moved)
-    other = jitter_factors(camera, 2, jitter, scene["means"].dtype, generator)
+    other = jitter_factors(camera, 2, jitter, generator)
     assert not torch.equal(draw(scene, texture, jitter=other).textured, moved.textured)
     with pytest.raises(ValueError, match=r"^jitter: expected shape"):
         draw(scene, texture, jitter=torch.ones(2, 3, dtype=factors.dtype, device=device))

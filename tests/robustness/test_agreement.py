@@ -66,7 +66,7 @@ def test_render_agrees_with_the_reference(name, textured, max_hits, sh_degree, c
 
     surfels64, texture64 = twin(surfels), twin(texture)
     camera64 = make_camera(scene | {"viewmat": scene["viewmat"].double().cpu(), "K": scene["K"].double().cpu()})
-    jitter = jitter_factors(camera, max_hits, 2.0, torch.float64) if name == "jittered" else None
+    jitter = jitter_factors(camera, max_hits, 2.0) if name == "jittered" else None
     if jitter is None:
         out = nw.render(surfels, texture, camera, **options)
     else:
