@@ -23,6 +23,7 @@ from nexwarp.data.sfm import SfmOptions, process
 from nexwarp.data.sfm.photos import FILMS, OTHERS, SUFFIXES
 from nexwarp.data.sfm.process import FRAMES, REPORT_FILE, source_identity
 from nexwarp.errors import FormatError, MissingError, RunError, SceneError
+from nexwarp.export.bake import Progress
 from nexwarp.io.json_files import READ_ERRORS, Json, finite, read_object, write_json
 from nexwarp.model.edit import write_edits
 from nexwarp.model.model import Model
@@ -143,23 +144,20 @@ class Eval:
         if source is None:
             lacks = "expected the photos to compare with, got a model alone; give --scene SCENE"
             raise MissingError(f"{self.run}: {lacks}")
-        opened.folder.mkdir(exist_ok=True)
-        with locked_run(opened.folder):
+        with locked_run(opened.folder), display.stages(console) as observe:
             opened = open_model(self.run)  # another process may have changed it
             model = opened.trained.to(device)
-            with display.stages(console) as observe:
-                scene = source.load(partial(observe, "reading photos"))
+            scene = source.load(partial(observe, "reading photos"))
             if not scene.test:
                 raise SceneError(f"{scene.path}: expected test views, found none")
             views = scene.test
             facts = read_metrics(opened.folder)
             facts.pop("test_poses", None)  # of an earlier evaluation
             if self.refine_poses:
-                with display.stages(console) as observe:
-                    views, moves = fit_poses(model, views, progress=partial(observe, "fitting test poses"))
+                views, moves = fit_poses(model, views, progress=partial(observe, "fitting test poses"))
                 facts["test_poses"] = {**moves}
             options = {"mask_mode": (opened.config or DEFAULT).mask_mode, "metrics": self.metrics}
-            results = evaluate_run(model, views, opened.folder, console, facts, **options)
+            results = evaluate_run(model, views, opened.folder, facts, observe, **options)
         rows = figures(results, self.metrics)
         fitted = ", poses fitted to their photos" if self.refine_poses else ""
         console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views{fitted}"))
@@ -182,14 +180,13 @@ def evaluate_run(
     model: Model,
     views: Sequence[View],
     run: Path,
-    console: Console,
     facts: dict[str, Json],
+    observe: Progress,
     **options: Any,
 ) -> dict[str, Json]:
     """Evaluate a model on test views and write metrics.json with `facts`; return its entries. See `evaluate`."""
-    with display.stages(console) as observe:
-        progress = partial(observe, "evaluating")
-        results = evaluate(model, views, renders=run / RENDERS_FOLDER, progress=progress, **options)
+    progress = partial(observe, "evaluating")
+    results = evaluate(model, views, renders=run / RENDERS_FOLDER, progress=progress, **options)
     entries = facts | cast(dict[str, Json], results)
     write_json(run / METRICS_FILE, finite(entries))
     return entries

@@ -230,7 +230,8 @@ class Session(StageStore):
         judged = self._judged_photos(trainer, model)
         if views:
             options = {"mask_mode": trainer.config.mask_mode, "ranks": self.ranks}
-            entries = evaluate_run(model, views, self.run, self.console, facts, **options)
+            with display.stages(self.console) as observe:
+                entries = evaluate_run(model, views, self.run, facts, observe, **options)
             rows = figures(entries)
             judged |= cast(dict[str, Values], entries["views"])
         save_photo_table(self.run / PHOTOS_FILE, {TRAIN: trainer.scene.train, TEST: views}, judged)
