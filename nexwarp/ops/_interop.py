@@ -156,7 +156,7 @@ def _as_declared(value: Argument, declared: Declared) -> Argument:
     if isinstance(value, tuple):
         value = dict(zip(declared.vars, value, strict=False))
     if isinstance(value, dict):
-        return struct(declared, **value)
+        return _struct(declared, value)
     if declared is None or not isinstance(value, torch.Tensor):
         return value
     dtype, own = declared
@@ -169,11 +169,11 @@ def _itself(value: Argument) -> Argument:
     return value
 
 
-def struct(kind: WarpObject, **fields: Argument) -> Argument:
+def _struct(kind: WarpObject, given: dict[str, Argument]) -> Argument:
     """Make a `wp.struct` argument of tensors, scalars and vectors; None is an array that is not there."""
     kind.ctype.__ctype__ = _itself  # how Warp asks its own instances
     value, declared = kind.ctype(), _fields_of(kind)
-    value.fields = {name: _as_declared(field, declared[name]) for name, field in fields.items() if field is not None}
+    value.fields = {name: _as_declared(field, declared[name]) for name, field in given.items() if field is not None}
     for name, field in value.fields.items():  # views of arrays, which keep their tensors alive
         setattr(value, name, field)
     return value

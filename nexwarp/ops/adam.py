@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import torch
 
-from nexwarp.kernels.adam import CPU_VALUES, MOST, VALUES, Adam, Addresses, Numbers
+from nexwarp.kernels.adam import CPU_VALUES, MOST, VALUES, Addresses, Numbers
 from nexwarp.kernels.adam import adam_step as step_kernel
 from nexwarp.kernels.launch import Sharing
 from nexwarp.kernels.tiles import LARGEST_INT
-from nexwarp.ops._interop import launch, struct
+from nexwarp.ops._interop import launch
 
 SMALLEST_SHARE = 64  # threads of a chunk on a CPU, at least
 
@@ -54,8 +54,7 @@ def adam_step(
         level_bits = (like.numel() // len(like)).bit_length() - 1
         losses = like.new_empty(threads[0] // warp)
     named = zip(("values", "means", "squares", "grads", "steps", "rates"), zip(*chosen, strict=True), strict=True)
-    adam = struct(
-        Adam,
+    adam = dict(
         starts=Numbers(*starts, *[LARGEST_INT] * unused),
         counts=Numbers(*(x.values.numel() for x in chosen), *[0] * unused),
         **{name: Addresses(*(0 if x is None else x.data_ptr() for x in xs), *[0] * unused) for name, xs in named},
