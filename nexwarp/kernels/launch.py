@@ -90,11 +90,11 @@ class _Command:
     """
 
     def __init__(
-        self, kernel: wp.Kernel, shape: tuple[int, ...], values: list[Any], device: wp.Device, block_dim: int
+        self, kernel: wp.Kernel, shape: tuple[int, ...], values: list[Any], stream: wp.Stream, block_dim: int
     ) -> None:
         self.shape = shape
         command: Any = wp.launch(
-            kernel, shape, inputs=values, device=device, block_dim=block_dim, record_tape=False, record_cmd=True
+            kernel, shape, inputs=values, device=stream.device, block_dim=block_dim, record_tape=False, record_cmd=True
         )
         self.command = command
         self.kinds = [type(param) for param in command.params]
@@ -133,12 +133,11 @@ def _launch_again(
     kernel: wp.Kernel, shape: tuple[int, ...], values: list[Any], stream: wp.Stream, block_dim: int
 ) -> None:
     """Launch on a GPU by the kernel's command. Threads take turns: a command's arguments are its own."""
-    device = stream.device
-    key = (kernel, device.alias, block_dim)
+    key = (kernel, stream.device.alias, block_dim)
     with _commands_lock:
         command = _commands.get(key)
         if command is None:
-            command = _commands[key] = _Command(kernel, shape, values, device, block_dim)
+            command = _commands[key] = _Command(kernel, shape, values, stream, block_dim)
         command.launch(shape, values, stream)
 
 
@@ -146,15 +145,14 @@ def launch(
     kernel: wp.Kernel,
     dim: int | tuple[int, int],
     arguments: Sequence[Any],
+    stream: wp.Stream | None,
     *,
-    device: wp.Device,
-    stream: wp.Stream | None = None,
     block_dim: int = 256,
     sharing: Sharing = LIGHT,
 ) -> None:
     """Launch a kernel, whose arguments are `first` and these, over the leading dimension of `dim`.
 
-    On CUDA, `block_dim` is the threads of a block and `stream` by default the device's current one.
+    It goes to a stream of a GPU, with blocks of `block_dim` threads, or, without one, to the CPU.
     """
     shape = (dim,) if isinstance(dim, int) else tuple(dim)
     if min(shape) == 0:
@@ -166,7 +164,7 @@ def launch(
     def part(bounds: tuple[int, int]) -> None:
         first, last = bounds
         here = (last - first, *shape[1:])
-        wp.launch(kernel, here, [first, *arguments], device=device, record_tape=False)
+        wp.launch(kernel, here, [first, *arguments], device="cpu", record_tape=False)
 
     most = EVEN_CHUNKS_A_THREAD * _threads if sharing.even else max(CHUNKS, CHUNKS_A_THREAD * _threads)
     split = chunks(shape[0], sharing.align, sharing.smallest, most)
@@ -176,5 +174,5 @@ def launch(
             part(bounds)
         return
     # Loading inside the threads would compile twice.
-    wp.load_module(module=kernel.module, device=device)
+    wp.load_module(module=kernel.module, device="cpu")
     _share(part, ranges)

@@ -1,6 +1,5 @@
 """What a tensor means and how it differentiates: one torch op a stage, the only torch <-> Warp boundary."""
 
-from nexwarp.ops._interop import start_warp
 from nexwarp.ops.activate import activate
 from nexwarp.ops.collect import Hits, SplatErrorRequest, collect, splat_error
 from nexwarp.ops.compose import compose
@@ -42,7 +41,6 @@ __all__ = [
     "plain_colors",
     "project",
     "splat_error",
-    "start_warp",
     "surface",
     "texture",
     "unproject",

@@ -214,24 +214,13 @@ def _can_load(library: str) -> bool:
 
 
 @functools.lru_cache(maxsize=64)
-def _array_at(pointer: int, length: int, dtype: type, kind: str, index: int | None) -> "wp.array[Any]":
-    return wp.array(ptr=pointer, dtype=dtype, shape=(length,), device=_device(kind, index))
+def _array_at(pointer: int, length: int, dtype: type, device: torch.device) -> "wp.array[Any]":
+    return wp.array(ptr=pointer, dtype=dtype, shape=(length,), device=str(device))
 
 
 def warp_array(tensor: torch.Tensor, dtype: type) -> "wp.array[Any]":
     """View a contiguous tensor (length,) as Warp's own functions take it; the view does not keep the tensor alive."""
-    return _array_at(tensor.data_ptr(), len(tensor), dtype, tensor.device.type, tensor.device.index)
-
-
-@functools.cache
-def _device(kind: str, index: int | None) -> wp.Device:
-    start_warp()
-    return wp.get_device("cpu" if kind == "cpu" else f"cuda:{index}")
-
-
-def device_of(tensor: torch.Tensor) -> wp.Device:
-    """Warp device of a tensor."""
-    return _device(tensor.device.type, tensor.device.index)
+    return _array_at(tensor.data_ptr(), len(tensor), dtype, tensor.device)
 
 
 @functools.cache
@@ -280,10 +269,10 @@ def launch(
     A `per_real` kernel is made for the type of `like` and `names`. Tensors become arrays, and tuples and dictionaries
     structs, of the types that the kernel declares, see `_as_declared`.
     """
+    start_warp()
     kernel = kernel if isinstance(kernel, wp.Kernel) else kernel(real_of(like), **names)
     arguments = [_as_declared(x, kind) for x, kind in zip((*inputs, *outputs), _arguments_of(kernel), strict=True)]
-    device, stream = device_of(like), stream_of(like)
-    launching.launch(kernel, dim, arguments, device=device, stream=stream, block_dim=block_dim, sharing=sharing)
+    launching.launch(kernel, dim, arguments, stream_of(like), block_dim=block_dim, sharing=sharing)
 
 
 def sums_in_fixed_point(like: torch.Tensor) -> bool:

@@ -113,11 +113,6 @@ class Walked(NamedTuple):
     camera: Pinhole
     channels: torch.Tensor | None = None
 
-    @property
-    def real(self) -> type:
-        """Warp's scalar type."""
-        return real_of(self.records)
-
     def arguments(self) -> list[Argument]:
         """The fields of the structs `Surfels`, `TileLists` and `View` of the kernels, in their order."""
         tiles, camera = self.tiles, self.camera
