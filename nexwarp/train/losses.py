@@ -24,20 +24,7 @@ OwnLoss = Callable[[Rendering, Target], torch.Tensor]
 SATURATION = 250 / 255
 # Factor of the squared pose corrections, which keeps poses near the given ones.
 POSE_PRIOR = 0.1
-BUILT_IN = (
-    "l1",
-    "dssim",
-    "texture",
-    "alpha",
-    "opacity",
-    "grid",
-    "empty",
-    "depth",
-    "depth_maps",
-    "normals",
-    "poses",
-    "regulariser",
-)
+BUILT_IN = ("l1", *LossWeights.__annotations__, "poses", "regulariser")
 ALPHA_HITS = 2  # of a pixel's hits, the heaviest ones whose weights the alpha term counts
 
 
