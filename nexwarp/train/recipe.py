@@ -59,45 +59,51 @@ def typed(name: str, value: object, annotation: object) -> object:
     raise ValueError(f"{name}: expected {expected}, got {json.dumps(value, default=repr)[:60]}")
 
 
-def _check_types(settings: object) -> None:
-    """Give each field of a dataclass the type of its annotation; ValueError names a field that has another."""
-    for name, annotation in get_type_hints(type(settings)).items():
-        object.__setattr__(settings, name, typed(name, getattr(settings, name), annotation))
+def within(default: float | None, low: float, high: float = math.inf) -> Any:
+    """Return a setting's field: a number from low to high, or several, or None."""
+    return field(default=default, metadata={"range": (low, high)})
+
+
+class Settings:
+    """Base of the dataclasses of settings; ValueError names a field of another type, or out of its range."""
+
+    def __post_init__(self) -> None:
+        annotations = get_type_hints(type(self))
+        for entry in dataclasses.fields(self):  # type: ignore[arg-type]  # of its subclasses
+            value = typed(entry.name, getattr(self, entry.name), annotations[entry.name])
+            object.__setattr__(self, entry.name, value)
+            if "range" in entry.metadata and value is not None:
+                for number in value if isinstance(value, tuple) else (value,):
+                    check_range(entry.name, number, *entry.metadata["range"])
 
 
 @dataclass(frozen=True)
-class LossWeights:
+class LossWeights(Settings):
     """Factors of the terms of the training loss; a term with factor 0 is not computed."""
 
-    dssim: float = 0.2
+    dssim: float = within(0.2, 0.0, 1.0)
     """Share of D-SSIM in the image loss; L1 has the rest."""
-    alpha: float = 0.005
+    alpha: float = within(0.005, 0.0)
     """Factor of the penalty on blending weight that the two heaviest hits of a pixel do not have."""
-    texture: float = 0.5
+    texture: float = within(0.5, 0.0)
     """Factor of the L1 distance between the un-premultiplied textured colours and the photo."""
-    opacity: float = 0.01
+    opacity: float = within(0.01, 0.0)
     """Factor of the surfels' mean opacity; makes them sparse."""
-    grid: float = 0.01
+    grid: float = within(0.01, 0.0)
     """Factor of the hash grid's squared values, each level divided by its resolution cubed."""
-    empty: float = 0.1
+    empty: float = within(0.1, 0.0)
     """Factor of the opacity in pixels that a mask declares as background."""
-    depth: float = 0.3
+    depth: float = within(0.3, 0.0)
     """Factor of the relative depth error at the points that were triangulated from the photo."""
-    depth_maps: float = 1.0
+    depth_maps: float = within(1.0, 0.0)
     """Factor of the relative depth error where photos have depth maps."""
-    normals: float = 0.0
+    normals: float = within(0.0, 0.0)
     """Factor of the normal consistency of 2DGS: the difference between the surfels' normals and those of the depth map.
     Counts from 7/30 of the run on; smoother meshes."""
 
-    def __post_init__(self) -> None:
-        _check_types(self)
-        check_range("dssim", self.dssim, 0.0, 1.0)
-        for name in ("alpha", "texture", "opacity", "grid", "empty", "depth", "depth_maps", "normals"):
-            check_range(name, getattr(self, name), 0.0)
-
 
 @dataclass(frozen=True)
-class LearningRates:
+class LearningRates(Settings):
     """Adam's learning rates; pairs decay log-linearly over the run."""
 
     means: tuple[float, float] = (1.6e-4, 1.6e-6)
@@ -120,7 +126,7 @@ class LearningRates:
     """First and last learning rate of the MLP."""
 
     def __post_init__(self) -> None:
-        _check_types(self)
+        super().__post_init__()
         for rate in dataclasses.fields(self):
             value = getattr(self, rate.name)
             ends = value if isinstance(value, tuple) else (value, value)
@@ -129,7 +135,7 @@ class LearningRates:
 
 
 @dataclass(frozen=True)
-class TextureConfig:
+class TextureConfig(Settings):
     """Shape of the neural texture (paper Sec. 5)."""
 
     levels: int = 8
@@ -155,59 +161,52 @@ class TextureConfig:
     """Fade levels whose cells are smaller than a pixel (paper Eq. 4)."""
 
     def __post_init__(self) -> None:
-        _check_types(self)
+        super().__post_init__()
         entries = 1 if self.table_size is None else self.table_size
         degree = 0 if self.sh_degree is None else self.sh_degree
         check_sizes(self.levels, entries, self.features, self.width, self.hidden_layers, degree)
 
 
 @dataclass(frozen=True)
-class DensifyConfig:
+class DensifyConfig(Settings):
     """When and how surfels are split and pruned; iterations are those of a run of 30,000."""
 
     start: int = 500
     """Iteration of the first round (exclusive)."""
     stop: int = 25_000
     """Iteration of the last round (exclusive)."""
-    every: int = 100
+    every: int = within(100, 1)
     """Iterations between rounds."""
-    fraction: float = 0.05
+    fraction: float = within(0.05, 0.0, 1.0)
     """Fraction of the surfels that a round splits, within the budget."""
-    prune_opacity: float = 0.005
+    prune_opacity: float = within(0.005, 0.0, 1.0)
     """Surfels with less opacity than this are removed."""
     prune_at_cap: bool = True
     """Prune also once the budget is used up, and split others in their place (the authors' code does neither)."""
-    relocate: float = 0.1
+    relocate: float = within(0.1, 0.0, 0.5)
     """Fraction of the surfels that every tenth round removes once the budget is used up, until iteration 15,000: those
     that contribute least to the training views. Others are split in their place. 0 removes none."""
 
-    def __post_init__(self) -> None:
-        _check_types(self)
-        check_range("every", self.every, 1)
-        check_range("fraction", self.fraction, 0.0, 1.0)
-        check_range("prune_opacity", self.prune_opacity, 0.0, 1.0)
-        check_range("relocate", self.relocate, 0.0, 0.5)
-
 
 @dataclass(frozen=True)
-class Recipe:
+class Recipe(Settings):
     """How a training goes about it: what few people change."""
 
-    steps_a_photo: int | None = None
+    steps_a_photo: int | None = within(None, 1)
     """Training steps for each training photo at most: shortens `iterations` where photos are few, to 7,000 at least."""
-    more_hits_from: int = 25_000
+    more_hits_from: int = within(25_000, 0)
     """With K > 2: the iteration, of a run of 30,000, from which more than 2 hits are textured. Geometry that converges
     with K = 2 has fewer floaters."""
-    sh_every: int = 1000
+    sh_every: int = within(1000, 1)
     """Iterations, of a run of 30,000, after which the SH degree rises by one."""
-    depth_jitter: float = 1.0
+    depth_jitter: float = within(1.0, 0.0, MAX_JITTER)
     """Standard deviation, in pixels at the hit's depth, of random shifts along the ray of the points at which training
     evaluates the texture."""
     filter_points: bool = True
     """Drop points with short tracks or large reprojection errors before sampling the initial surfels."""
     orient_points: bool = True
     """Orient the initial surfels along planes fitted to the point cloud; otherwise their rotations are random."""
-    skybox: int = 100
+    skybox: int = within(100, 0)
     """Number of points on a sphere around the scene, for backgrounds without points of the cloud, such as the room
     behind a table. Initial surfels start on those around which photos show no point of the cloud. They are at most a
     sixth of the initial surfels. Where photos are transparent there are none."""
@@ -220,14 +219,6 @@ class Recipe:
     densify: DensifyConfig = field(default_factory=DensifyConfig)
     """Density control."""
 
-    def __post_init__(self) -> None:
-        _check_types(self)
-        check_range("steps_a_photo", 1 if self.steps_a_photo is None else self.steps_a_photo, 1)
-        check_range("more_hits_from", self.more_hits_from, 0)
-        check_range("sh_every", self.sh_every, 1)
-        check_range("depth_jitter", self.depth_jitter, 0.0, MAX_JITTER)
-        check_range("skybox", self.skybox, 0)
-
 
 @dataclass(frozen=True)
 class Config(Recipe):
@@ -235,15 +226,15 @@ class Config(Recipe):
 
     preset: str = "default"
     """Name of the preset from which the settings started."""
-    iterations: int = REFERENCE_ITERATIONS
+    iterations: int = within(REFERENCE_ITERATIONS, 1)
     """Number of training steps; each renders one view. All schedules stretch with this number."""
-    max_surfels: int = 400_000
+    max_surfels: int = within(400_000, MIN_SURFELS)
     """P, the largest number of surfels. At most half as many start from the point cloud."""
-    max_hits: int = 2
+    max_hits: int = within(2, 0, MAX_HITS)
     """K, the number of ray-surfel hits that are textured in each pixel, 0 to 8; 0 trains without a texture."""
-    sh_degree: int = 3
+    sh_degree: int = within(3, 0, MAX_SH_DEGREE)
     """SH degree of the surfels' colours, 0 to 3, and of the texture's. Training starts at degree 0."""
-    background: tuple[float, float, float] | None = None
+    background: tuple[float, float, float] | None = within(None, 0.0, 1.0)
     """Background colour; None takes that of the scene, or the mean colour of the training photos."""
     mask_mode: str = "ignore"
     """How masked pixels are trained: `ignore` leaves them out of the loss, `background` trains them to show the
@@ -262,7 +253,7 @@ class Config(Recipe):
     refine_poses: bool = False
     """Learn a small rigid correction of each training camera, for poses that are not exact. Test poses stay as given;
     `nexwarp eval --refine-poses` fits them, too."""
-    teachers: int | None = None
+    teachers: int | None = within(None, 0, MOST_TEACHERS)
     """Number of teachers: models of other seeds that are trained first, in two fifths of the iterations, and from whose
     renderings the run then learns, too, for captures of few photos (docs/sparse.md). Each has four times `max_surfels`
     but at most 40,000, and never fewer than `max_surfels`. None is 2 where there are at most 44 training photos, at
@@ -271,7 +262,7 @@ class Config(Recipe):
     order: str = "depth"
     """Order in which surfels are blended, in training and in the model: `depth` is by their centres' z-depth,
     `distance` by their distance from the camera, for scenes that are shown as panoramas."""
-    seed: int = 0
+    seed: int = within(0, 0, 2**32 - 1)
     """Random seed."""
     deterministic: bool = False
     """Give the same bits in every run also on CUDA, where sums otherwise depend on the order of threads; slower."""
@@ -280,18 +271,9 @@ class Config(Recipe):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range("iterations", self.iterations, 1)
-        check_range("max_surfels", self.max_surfels, MIN_SURFELS)
-        check_range("max_hits", self.max_hits, 0, MAX_HITS)
-        check_range("sh_degree", self.sh_degree, 0, MAX_SH_DEGREE)
-        check_range("seed", self.seed, 0, 2**32 - 1)
         if self.smooth_sh != 0.0:
             check_range("smooth_sh, where it is not 0,", self.smooth_sh, MIN_STRENGTH, MAX_STRENGTH)
-        for value in self.background or ():
-            check_range("background", value, 0.0, 1.0)
         check_order(self.order)
-        if self.teachers is not None:
-            check_range("teachers", self.teachers, 0, MOST_TEACHERS)
         if self.teachers and self.refine_poses:
             raise ValueError(f"teachers: expected 0 or null where poses are learned, got {self.teachers}")
         if self.mask_mode not in MASK_MODES:
