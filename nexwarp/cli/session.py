@@ -200,11 +200,9 @@ class Session(StageStore):
             finished = trainer.finish(observe)
         file = save_model(folder, finished)
         model = shared_model(file, self.ranks)
-        cameras = unrefined = trainer.scene.cameras
-        if trainer.poses is not None:
-            refined = trainer.views.refined_cameras(trainer.poses)
-            cameras = unrefined | {TRAIN: dict(zip(unrefined[TRAIN], refined, strict=True))}
-        save_cameras(folder / CAMERAS_FILE, cameras, unrefined)
+        given = trainer.scene.cameras
+        refined = {view.name: view.camera for view in trainer.views.refined(trainer.poses)}
+        save_cameras(folder / CAMERAS_FILE, given | {TRAIN: refined}, given)
         iterations = trainer.iteration + (0 if stage.teacher else stage.before)
         seconds = trainer.seconds + (0 if stage.teacher else self.seconds)
         facts: dict[str, Json] = {
@@ -273,13 +271,13 @@ def _model_kept(folder: Path, trainer: Trainer) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        model = "the current model is saved"
+        model, checkpoint = "the current model is saved", "there is no checkpoint"
         try:
             save_model(folder, trainer.model())
         except OSError:
             model = "the model cannot be saved either"
-        kept = "--resume continues from the last checkpoint"
-        checkpoint = kept if has_checkpoint(folder) else "there is no checkpoint"
+        if has_checkpoint(folder):
+            checkpoint = "--resume continues from the last checkpoint"
         stop = f"training stops at iteration {trainer.iteration:,}: {model}, {checkpoint}"
         raise StorageError(f"{error}; {stop}") from error
 
