@@ -264,20 +264,15 @@ def _directions(count: int, generator: torch.Generator) -> torch.Tensor:
 
 def _cover(points: torch.Tensor, colors: torch.Tensor, n: int, spread: float = 1.0) -> nw.Surfels:
     """Spread n surfels over points, as large as those lie apart, times `spread`."""
-    spacing = _spacing(points)
+    from scipy.spatial import cKDTree
+
+    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=4, workers=-1)
+    spacing = torch.from_numpy(distances[:, 1:].mean(axis=1)).float()
     generator = torch.Generator().manual_seed(0)
     chosen = torch.randperm(len(points) * -(-n // len(points)), generator=generator)[:n] % len(points)
     size = spacing[chosen] * max((len(points) / n) ** 0.5, 0.6) * spread
     means = points[chosen] + torch.randn(n, 3, generator=generator) * size[:, None] * 0.5
     return _surfels(means, size, colors[chosen], generator)
-
-
-def _spacing(points: torch.Tensor) -> torch.Tensor:
-    from scipy.spatial import cKDTree
-
-    array = points.numpy()
-    distances, _ = cKDTree(array).query(array, k=4, workers=-1)
-    return torch.from_numpy(distances[:, 1:].mean(axis=1)).float()
 
 
 def _surfels(means: torch.Tensor, size: torch.Tensor, colors: torch.Tensor, generator: torch.Generator) -> nw.Surfels:

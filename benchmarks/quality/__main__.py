@@ -1,16 +1,15 @@
 """The quality benchmark's command line: `python -m benchmarks.quality --help`."""
 
 import argparse
-import dataclasses
 import json
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 from benchmarks import quality
 from benchmarks.quality.curve import draw
 from benchmarks.quality.documents import MISSING, blocks, fill
-from benchmarks.quality.jobs import FOLDS, ITERATIONS, ROWS, SCENES, SIZE, TABLES, Row, TrainingJob, table_jobs
+from benchmarks.quality.jobs import FOLDS, ITERATIONS, ROWS, SCENES, SIZE, TABLES, Row, TrainingJob
 from benchmarks.quality.results import read_results
 from benchmarks.quality.results import table as results_table
 from benchmarks.quality.run import Places, missing_jobs, run_jobs
@@ -20,7 +19,7 @@ from benchmarks.timing import ROOT
 def train(options: argparse.Namespace) -> int:
     """Run the trainings that the results file lacks."""
     rows = ROWS | own_rows(options.row or ())
-    jobs = missing_jobs(wanted_jobs(options, rows), options.out)
+    jobs = missing_jobs(wanted_jobs(options), options.out)
     places = Places(options.data, options.pictures, options.models, options.curve)
     failed = run_jobs(jobs, rows, places, options.out, options.jobs)
     return 1 if failed else 0
@@ -37,22 +36,19 @@ def own_rows(texts: Iterable[str]) -> dict[str, Row]:
     return rows
 
 
-def wanted_jobs(options: argparse.Namespace, rows: Mapping[str, Row]) -> list[TrainingJob]:
-    """Return the jobs that are asked for, each once."""
-    seeds = [int(x) for x in options.seeds.split(",")]
-    scenes = options.scenes.split(",")
+def wanted_jobs(options: argparse.Namespace) -> list[TrainingJob]:
+    """Return the jobs that are asked for, each once; ValueError for an unknown table."""
+    tables = options.tables.split(",") if options.tables else []
+    if unknown := set(tables) - TABLES.keys():
+        raise ValueError(f"--tables: expected some of {', '.join(TABLES)}, got {', '.join(unknown)}")
+    wanted = [(row.name, size) for rows, sizes in (TABLES[name] for name in tables) for size in sizes for row in rows]
+    wanted += [(text.split(":", 1)[0], options.size) for text in options.row or ()]
     jobs = [
-        dataclasses.replace(job, downscale=options.downscale, variant=options.variant)
-        for table in filter(None, (options.tables or "").split(","))
-        for job in table_jobs(table, scenes, seeds, options.iterations)
+        TrainingJob(scene, options.variant, row, size, int(seed), options.iterations, options.downscale)
+        for scene in options.scenes.split(",")
+        for row, size in wanted
+        for seed in options.seeds.split(",")
     ]
-    for text in options.row or ():
-        name = text.split(":", 1)[0]
-        jobs += [
-            TrainingJob(scene, options.variant, name, options.size, seed, options.iterations, options.downscale)
-            for scene in scenes
-            for seed in seeds
-        ]
     return [*dict.fromkeys(jobs)]
 
 

@@ -1,7 +1,6 @@
 """The ways of training that the quality benchmark compares, and the trainings of each table."""
 
 import dataclasses
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -48,7 +47,7 @@ PEERS = (
 )
 RAW_PEERS = tuple(row for row in PEERS if not row.settings.get("exposures"))
 ROWS = {row.name: row for row in (DEFAULT, RAW, PAPER, *PEERS)}
-TABLES = {
+TABLES: dict[str, tuple[tuple[Row, ...], tuple[int, ...]]] = {  # rows and budgets
     "peers": ((DEFAULT, *PEERS), (SIZE, SIZE // 4)),
     "raw": ((DEFAULT, RAW, *RAW_PEERS), (SIZE,)),
     "paper": ((PAPER,), (SIZE,)),
@@ -78,19 +77,6 @@ class TrainingJob:
     iterations: int
     downscale: int = 1
     images: str = "images"
-
-
-def table_jobs(table: str, scenes: Iterable[str], seeds: Iterable[int], iterations: int) -> Iterator[TrainingJob]:
-    """Yield the jobs of a table; raise ValueError where it is unknown."""
-    if table not in TABLES:
-        raise ValueError(f"--tables: expected some of {', '.join(TABLES)}, got {table}")
-    rows, sizes = TABLES[table]
-    seeds = tuple(seeds)
-    for scene in scenes:
-        for size in sizes:
-            for row in rows:
-                for seed in seeds:
-                    yield TrainingJob(scene, "", row.name, size, seed, iterations)
 
 
 def config_of(job: TrainingJob, row: Row) -> Config:
