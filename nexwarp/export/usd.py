@@ -17,7 +17,7 @@ from nexwarp.export.glb import quads
 from nexwarp.export.mesh import Mesh
 from nexwarp.export.splats import gaussians
 from nexwarp.io.files import write_atomically
-from nexwarp.io.pictures import to_uint8
+from nexwarp.io.pictures import encoded, to_uint8
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.model.surfels import Surfels
 
@@ -43,13 +43,12 @@ def save_usdz(
     if given, is a mesh that is not shown, for physics. The mean of the cameras' upward directions becomes +y, by the
     default prim. FormatError: there are no cards.
     """
-    from PIL import Image
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils
 
     if not len(scene.shape.means):
         raise FormatError(f"{path}: expected surfels that are opaque enough to be seen, found none")
     with tempfile.TemporaryDirectory() as folder:
-        Image.fromarray(to_uint8(scene.texels).cpu().numpy(), "RGBA").save(Path(folder, "atlas.png"))
+        Path(folder, "atlas.png").write_bytes(encoded(to_uint8(scene.texels).cpu().numpy(), format="PNG"))
         stage = Usd.Stage.CreateNew(str(Path(folder, "scene.usdc")))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)

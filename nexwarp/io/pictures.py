@@ -44,7 +44,7 @@ def to_uint8(image: torch.Tensor) -> torch.Tensor:
 
 def save_png(path: str | os.PathLike[str], image: torch.Tensor) -> None:
     """Write an (H, W, 3) image, uint8 or float in [0, 1], as a PNG file, atomically; missing folders are created."""
-    write_atomically(path, _encoded(_shown("image", image).numpy(), **PNG), durable=False)
+    write_atomically(path, encoded(_shown("image", image).numpy(), **PNG), durable=False)
 
 
 @contextmanager
@@ -67,7 +67,7 @@ def png_files() -> Iterator[Callable[[Path, torch.Tensor], None]]:
             while coming and (len(coming) >= 2 * THREADS or held > MOST_HELD or coming[0][1].done()):
                 held -= coming[0][2]
                 write_first()
-            coming.append((path, pool.submit(_encoded, _shown("image", image).numpy(), **PNG), image.numel()))
+            coming.append((path, pool.submit(encoded, _shown("image", image).numpy(), **PNG), image.numel()))
 
         try:
             yield save
@@ -79,12 +79,12 @@ def png_files() -> Iterator[Callable[[Path, torch.Tensor], None]]:
 
 def save_jpeg(path: str | os.PathLike[str], image: torch.Tensor, quality: int) -> None:
     """Write an image as a JPEG file of quality 1 to 100 with full colour resolution; see `save_png`."""
-    content = _encoded(_shown("image", image).numpy(), format="JPEG", quality=quality, subsampling=0)
+    content = encoded(_shown("image", image).numpy(), format="JPEG", quality=quality, subsampling=0)
     write_atomically(path, content, durable=False)
 
 
-def _encoded(pixels: np.ndarray, **options: Any) -> bytes:
-    """Return the content of a file of uint8 pixels (H, W, 3); compressing frees the GIL."""
+def encoded(pixels: np.ndarray, **options: Any) -> bytes:
+    """Return the content of a file of uint8 pixels (H, W, 3 or 4), with options of PIL; compressing frees the GIL."""
     from PIL import Image
 
     content = io.BytesIO()

@@ -20,6 +20,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.paths import surrounding
 from nexwarp.errors import check_package
 from nexwarp.io.files import one_line
+from nexwarp.io.pictures import encoded
 from nexwarp.model.model import Model
 from nexwarp.viewer import pacing
 from nexwarp.viewer.modes import TEXTURED, Picture, Settings, draw
@@ -237,8 +238,6 @@ class Viewer:
         return picture
 
     def _screenshot(self, session: Session, height: int) -> None:
-        from PIL import Image
-
         session.screenshot = None
         here, settings = session.viewpoint, session.settings
         if here is None:
@@ -246,10 +245,8 @@ class Viewer:
         session.drawn_at = time.perf_counter()
         picture = self._picture(here, pacing.limited(height / here.height, here.width, here.height), settings)
         assert picture is not None  # never stale
-        file = io.BytesIO()
-        Image.fromarray(picture.pixels).save(file, format="PNG")
         name = f"{self.options.title}_{settings.mode}.png".replace(" ", "_")
-        session.client.send_file_download(name, file.getvalue(), save_immediately=True)
+        session.client.send_file_download(name, encoded(picture.pixels, format="PNG"), save_immediately=True)
 
     # The page
 

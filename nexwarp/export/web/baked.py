@@ -1,6 +1,5 @@
 """The files of the baked scene, which the page draws where there is no WebGPU; FORMAT.md describes them."""
 
-import io
 from collections.abc import Mapping
 
 import numpy as np
@@ -9,6 +8,7 @@ import torch
 from nexwarp.cameras.camera import Camera
 from nexwarp.export.baked_scene import ATLAS_FILE, BAKED_FILE, MAGIC, BakedScene
 from nexwarp.export.web.scene_file import array_of, joined_file, scene_arrays, scene_header
+from nexwarp.io.pictures import encoded
 from nexwarp.model.model import Model
 
 QUALITY = 95  # of the lossy picture: 0.1 dB against photos of the demo, at 0.3 of the size of a lossless one
@@ -76,9 +76,5 @@ def encode_atlas(atlas: torch.Tensor) -> tuple[torch.Tensor, float]:
 
 def encode_picture(atlas: torch.Tensor) -> tuple[bytes, float]:
     """Return an atlas (height, width, 3) as a WebP picture, and the value that 127 steps stand for."""
-    from PIL import Image
-
     codes, scale = encode_atlas(atlas)
-    content = io.BytesIO()
-    Image.fromarray(codes.cpu().numpy()).save(content, format="WEBP", quality=QUALITY, method=6)
-    return content.getvalue(), scale
+    return encoded(codes.cpu().numpy(), format="WEBP", quality=QUALITY, method=6), scale

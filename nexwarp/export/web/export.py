@@ -2,7 +2,6 @@
 
 import base64
 import html
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from nexwarp.export.web.baked import encode_baked
 from nexwarp.export.web.scene_file import SCENE_FILE, encode_scene
 from nexwarp.io.files import write_together
 from nexwarp.io.json_files import read_json
-from nexwarp.io.pictures import to_uint8
+from nexwarp.io.pictures import encoded, to_uint8
 from nexwarp.model.model import Model
 
 INDEX = "index.html"
@@ -182,11 +181,7 @@ def one_file(content: Mapping[str, bytes]) -> bytes:
 @torch.no_grad()
 def _poster(model: Model, camera: Camera) -> bytes:
     """Return a JPEG picture of a camera, at most 640 pixels wide."""
-    from PIL import Image
-
     scale = min(POSTER_WIDTH / max(camera.width, camera.height), 1.0)
     small = resized(camera, max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
-    stream = io.BytesIO()
-    picture = Image.fromarray(to_uint8(model.render_image(small)).cpu().numpy())
-    picture.save(stream, "JPEG", quality=POSTER_QUALITY, optimize=True)
-    return stream.getvalue()
+    pixels = to_uint8(model.render_image(small)).cpu().numpy()
+    return encoded(pixels, format="JPEG", quality=POSTER_QUALITY, optimize=True)
