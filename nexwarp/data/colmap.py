@@ -126,8 +126,7 @@ def read_model(path: Path, images: Path, follow_links: bool = False, need_points
         points = read_points(points_file)
     if not records:
         raise ValueError(f"{folder}: the COLMAP model has no registered images")
-    lenses: dict[int, Lens] = {}
-    photos = [_photo(image, cameras, lenses, folder, images, follow_links) for image in records.values()]
+    photos = [_photo(image, cameras, folder, images, follow_links) for image in records.values()]
     if points is not None and len(points.table):
         points = _without_strays(points, records, folder)
         cloud = _cloud(points.table, folder)
@@ -137,24 +136,18 @@ def read_model(path: Path, images: Path, follow_links: bool = False, need_points
 
 
 def _photo(
-    image: ImageRecord,
-    cameras: dict[int, CameraRecord],
-    lenses: dict[int, Lens],
-    folder: Path,
-    images: Path,
-    follow_links: bool,
+    image: ImageRecord, cameras: dict[int, CameraRecord], folder: Path, images: Path, follow_links: bool
 ) -> Photo:
     name = safe_name(f"{folder}: image name", image.name, "images folder", images)
     where = f"{folder}: {name}"
     file = inside_folder(f"{folder}: image name", find_file(images, name), images, follow_links)
     if image.camera not in cameras:
         raise ValueError(f"{where}: expected a camera of the model, got id {image.camera}")
-    if image.camera not in lenses:
-        try:
-            lenses[image.camera] = Lens(*cameras[image.camera])
-        except ValueError as error:
-            raise ValueError(f"{where}: the COLMAP camera of this image is not usable: {error}") from error
-    return Photo(name, file, _viewmat(where, image.pose), lenses[image.camera])
+    try:
+        lens = Lens(*cameras[image.camera])
+    except ValueError as error:
+        raise ValueError(f"{where}: the COLMAP camera of this image is not usable: {error}") from error
+    return Photo(name, file, _viewmat(where, image.pose), lens)
 
 
 def _viewmat(where: str, pose: tuple[float, ...]) -> np.ndarray:
