@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 
+from nexwarp.data.images import Color
 from nexwarp.data.lens import Lens
 from nexwarp.errors import MissingError, NexwarpError, SceneError
 from nexwarp.io.files import one_line
@@ -78,16 +79,10 @@ class Capture:
     photos: list[Photo]  # sorted by name
     cloud: Cloud | None  # None if the scene has none
     origin: np.ndarray  # (3,) float64, world coordinates of the origin of photos and cloud; see `Scene.origin`
-    background: tuple[float, float, float] | None = None  # behind transparent photos; None drops their alpha
+    background: Color | None = None  # behind transparent photos; None drops their alpha
 
     @classmethod
-    def of(
-        cls,
-        source: Path,
-        photos: list[Photo],
-        cloud: Cloud | None,
-        background: tuple[float, float, float] | None = None,
-    ) -> "Capture":
+    def of(cls, source: Path, photos: list[Photo], cloud: Cloud | None, background: Color | None = None) -> "Capture":
         """Sort photos by name, and move photos and cloud from the world frame to one near them where that is needed.
 
         ValueError: two photos have one name.

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -36,6 +36,7 @@ EXIF_ERRORS = (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.err
 EXR, DEEP = ".exr", (".png", ".tif", ".tiff")  # suffixes of files of linear light, and of those of up to 16 bits
 COPY_QUALITY = 97  # of upright copies of JPEG files
 
+Color: TypeAlias = tuple[float, float, float]  # sRGB in [0, 1]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -308,7 +309,7 @@ def _to_rgb(image: "PIL.Image.Image") -> np.ndarray:
     return np.array(image.convert("RGB"))
 
 
-def compose(image: torch.Tensor, alpha: torch.Tensor, background: tuple[float, float, float]) -> torch.Tensor:
+def compose(image: torch.Tensor, alpha: torch.Tensor, background: Color) -> torch.Tensor:
     """Composite a photo (H, W, 3) uint8, not premultiplied, of alpha (H, W) uint8 on a colour in [0, 1], in sRGB."""
     out = torch.empty_like(image)
     for channel, color in enumerate(background):

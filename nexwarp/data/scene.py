@@ -33,7 +33,7 @@ from nexwarp.data.capture import (
 from nexwarp.data.colmap import has_model, read_model
 from nexwarp.data.depth_files import with_depths
 from nexwarp.data.depth_fit import fit_depths
-from nexwarp.data.images import EXR, quiet_pillow, read_in_threads
+from nexwarp.data.images import EXR, Color, quiet_pillow, read_in_threads
 from nexwarp.data.in_memory import as_bytes, make_cloud, near_origin, split_views
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.ply import read_ply
@@ -118,6 +118,11 @@ class SceneSource:
         return source
 
     @property
+    def folder(self) -> Path:
+        """Folder of the scene's files."""
+        return demo_folder() if self.path == DEMO else Path(self.path)
+
+    @property
     def name(self) -> str:
         """Name of the scene, for folders and tables."""
         return DEMO if self.path == DEMO else Path(self.path).resolve().name
@@ -130,15 +135,12 @@ class SceneSource:
 
     def load(self, progress: ProgressCallback | None = None) -> "Scene":
         """Read the scene; progress and errors are those of `load_scene`."""
-        return _read_scene(self, self._folder(), progress or (lambda done, total: None))
+        return _read_scene(self, progress or (lambda done, total: None))
 
     def photos(self) -> list[Photo]:
         """Read the photos' names, files and lenses, without pixels; errors are those of `load_scene`."""
         with quiet_pillow(), scene_errors():
-            return _read_capture(self, self._folder()).photos
-
-    def _folder(self) -> Path:
-        return demo_folder() if self.path == DEMO else Path(self.path)
+            return _read_capture(self).photos
 
 
 @dataclass(frozen=True)
@@ -177,7 +179,7 @@ class Scene:
     reprojection_errors: torch.Tensor
     scale: float
     path: Path
-    background: tuple[float, float, float] | None = None
+    background: Color | None = None
     random_background: bool = False
     white: float | None = None
     origin: torch.Tensor = field(default_factory=partial(torch.zeros, 3, dtype=torch.float64))
@@ -330,8 +332,8 @@ def _check_types(source: SceneSource) -> None:
             raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}")
 
 
-def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback) -> Scene:
-    """Read the scene of a source whose folder is `path`."""
+def _read_scene(source: SceneSource, progress: ProgressCallback) -> Scene:
+    path = source.folder
     if source.downscale < 1:
         raise ValueError(f"downscale: expected at least 1, got {source.downscale}")
     if source.linear is not None and not 0 < source.linear < math.inf:
@@ -343,7 +345,7 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback) -> 
             raise NotADirectoryError(f"{path}: expected the folder of a scene, got a file; give {path.parent}")
         if not path.is_dir():
             raise FileNotFoundError(f"{path}: no such folder, expected a scene: COLMAP, nerfstudio or Blender")
-        capture = _read_capture(source, path)
+        capture = _read_capture(source)
         if len(capture.photos) < 2:
             raise ValueError(f"{capture.source}: expected at least 2 registered images (1 to train, 1 to test), got 1")
         cloud = capture.cloud
@@ -352,7 +354,7 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback) -> 
         viewmats = [photo.viewmat for photo in capture.photos if not photo.test]
         scale = _scene_scale(str(capture.source), viewmats, cloud)
         background = capture.background if color is None else color
-        train, held_out = _read_views(source, path, capture, background, NEAR_FRACTION * scale, progress)
+        train, held_out = _read_views(source, capture, background, NEAR_FRACTION * scale, progress)
         train = fit_depths(train, cloud, path)
         if color is None and all(view.alpha is None for view in train + held_out):
             background = None  # behind opaque photos there is none to see
@@ -362,7 +364,7 @@ def _read_scene(source: SceneSource, path: Path, progress: ProgressCallback) -> 
     return dataclasses.replace(scene, random_background=random, white=white)
 
 
-def parse_color(color: str | Sequence[float] | None) -> tuple[float, float, float] | None:
+def parse_color(color: str | Sequence[float] | None) -> Color | None:
     """Three numbers in [0, 1] of a colour's name, of "R,G,B" or of three numbers; None stays None."""
     if color is None:
         return None
@@ -406,38 +408,26 @@ def find_format(path: Path, format: str | None = None) -> str:
 
 
 def _read_views(
-    source: SceneSource,
-    path: Path,
-    capture: Capture,
-    background: tuple[float, float, float] | None,
-    near: float,
-    progress: ProgressCallback,
+    source: SceneSource, capture: Capture, background: Color | None, near: float, progress: ProgressCallback
 ) -> tuple[list[View], list[View]]:
     """Read all photos; return the training views and the test views."""
     alpha_mask = source.masks == ALPHA
     positions = None if capture.cloud is None else capture.cloud.positions.astype(np.float32)
-    reader = ViewReader(source.downscale, background, alpha_mask, source.linear, positions)
-    photos = with_depths(path, _with_masks(path, capture.photos, source.masks))
+    x, y, z = capture.origin.tolist()
+    reader = ViewReader(source.downscale, background, alpha_mask, source.linear, positions, near, (x, y, z))
+    photos = with_depths(source.folder, _with_masks(source, capture.photos))
     photos = [dataclasses.replace(photo, depth=None) if photo.test else photo for photo in photos]
     jobs = list(chain.from_iterable(read_in_threads(reader.plan, photos, MAX_READERS)))
     channels = 3 + (background is not None) + (alpha_mask or any(job.photo.mask for job in jobs))
     channels += DEPTH_BYTES * any(job.photo.depth for job in jobs)
-    workers = _workers(source, path, channels, jobs)
-    x, y, z = capture.origin.tolist()
-    views = read_in_threads(
-        lambda job: reader.read(job, near, (x, y, z)), jobs, workers, lambda done: progress(done, len(jobs))
-    )
+    workers = _workers(source, channels, jobs)
+    views = read_in_threads(reader.read, jobs, workers, lambda done: progress(done, len(jobs)))
     train = [view for job, view in zip(jobs, views, strict=True) if not job.photo.test]
     return train, [view for job, view in zip(jobs, views, strict=True) if job.photo.test]
 
 
 def _make_scene(
-    train: list[View],
-    test: list[View],
-    cloud: Cloud | None,
-    scale: float,
-    path: Path,
-    background: tuple[float, float, float] | None,
+    train: list[View], test: list[View], cloud: Cloud | None, scale: float, path: Path, background: Color | None
 ) -> Scene:
     """Make a scene of its parts; random points where there is no cloud."""
     cloud = _thinned(random_points(train, scale) if cloud is None else cloud)
@@ -467,9 +457,9 @@ def _given_points(file: Path, capture: Capture) -> Cloud:
     return cloud
 
 
-def _read_capture(source: SceneSource, path: Path) -> Capture:
+def _read_capture(source: SceneSource) -> Capture:
     """Read a capture without the photos to exclude, on which it does not depend which photos are for testing."""
-    capture = _read_files(source, path)
+    capture = _read_files(source)
     photos = [
         dataclasses.replace(photo, test=index % TEST_EVERY == 0 if photo.test is None else photo.test)
         for index, photo in enumerate(capture.photos)
@@ -494,7 +484,8 @@ def _matching(names: Sequence[str], pattern: str) -> set[str]:
     return equal or {name for name in names if fnmatchcase(plain[name], pattern)}
 
 
-def _read_files(source: SceneSource, path: Path) -> Capture:
+def _read_files(source: SceneSource) -> Capture:
+    path = source.folder
     kind = find_format(path, source.format)
     if kind == "colmap":
         capture = read_model(path, path / source.images, source.follow_links, source.points is None)
@@ -517,8 +508,9 @@ def _check_folder(argument: str, path: Path, name: str) -> None:
         raise FileNotFoundError(f"{argument}: no folder {name!r} in {path}, which has {there}")
 
 
-def _with_masks(path: Path, photos: list[Photo], masks: str | None) -> list[Photo]:
+def _with_masks(source: SceneSource, photos: list[Photo]) -> list[Photo]:
     """The photos with the mask that goes with each."""
+    path, masks = source.folder, source.masks
     if masks in (None, NONE, ALPHA):
         return [dataclasses.replace(photo, mask=None) for photo in photos]
     if masks == MASKS and (any(photo.mask for photo in photos) or not (path / masks).is_dir()):
@@ -553,7 +545,7 @@ def photos_bytes(sizes: Sequence[tuple[int, int]], downscale: int, channels: int
     return sum((width // downscale) * (height // downscale) * channels for width, height in sizes)
 
 
-def _workers(source: SceneSource, path: Path, channels: int, jobs: list[PlannedView]) -> int:
+def _workers(source: SceneSource, channels: int, jobs: list[PlannedView]) -> int:
     """How many photos to read at a time, so that what reading takes beside them fits as well.
 
     ValueError: the photos do not fit; the message suggests a downscale or a folder of smaller images.
@@ -568,11 +560,11 @@ def _workers(source: SceneSource, path: Path, channels: int, jobs: list[PlannedV
         advice = "use fewer photos"
         if fit is not None:
             advice = f"use downscale={fit} ({photos_bytes(sizes, fit, channels) / GIB:.1f} GiB)"
-            folders = sorted(f.name for f in path.glob("images_*") if f.is_dir() and f.name != source.images)
+            folders = sorted(f.name for f in source.folder.glob("images_*") if f.is_dir() and f.name != source.images)
             advice += f" or a folder of smaller images ({', '.join(folders)})" if folders else ""
         width, height = max(sizes)
         raise ValueError(
-            f"{path}: {len(sizes)} photos of up to {width}x{height} at downscale={source.downscale} need "
+            f"{source.folder}: {len(sizes)} photos of up to {width}x{height} at downscale={source.downscale} need "
             f"{need / GIB:.1f} GiB of host memory, of which {free / GIB:.1f} GiB are free; {advice}"
         )
     largest = max(

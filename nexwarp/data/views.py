@@ -15,6 +15,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.data.capture import Photo
 from nexwarp.data.depth_files import read_depth
 from nexwarp.data.images import (
+    Color,
     compose,
     downscale_image,
     downscale_mask,
@@ -94,10 +95,12 @@ class ViewReader:
     """Reads views; thread-safe."""
 
     downscale: int  # factor by which images are reduced, averaging blocks of pixels
-    background: tuple[float, float, float] | None  # behind transparent photos; None drops their alpha
+    background: Color | None  # behind transparent photos; None drops their alpha
     alpha_mask: bool  # use alpha >= 128 as the mask
     white: float | None  # as of `read_image`
     positions: np.ndarray | None  # (P, 3) float32 of the capture's points
+    near: float  # of all cameras
+    origin: tuple[float, float, float]  # of all cameras
 
     def __post_init__(self) -> None:
         self._maps, self._lock = lru_cache(KEPT_MAPS)(undistortion), Lock()
@@ -128,8 +131,8 @@ class ViewReader:
             return [PlannedView(photo, size, target)]
         return [PlannedView(_face(photo, face), size, target) for face in FACES]
 
-    def read(self, plan: PlannedView, near: float, origin: tuple[float, float, float]) -> View:
-        """Read, undistort and reduce a photo; `near` and `origin` are those of its camera."""
+    def read(self, plan: PlannedView) -> View:
+        """Read, undistort and reduce a photo."""
         photo = plan.photo
         image, alpha, mask = self._pixels(plan)
         depth = None if photo.depth is None else self._depth(plan, photo.depth)
@@ -142,7 +145,7 @@ class ViewReader:
         K[:2] /= self.downscale
         try:
             viewmat = torch.from_numpy(photo.viewmat).float()
-            camera = Camera(viewmat, K.float(), image.shape[1], image.shape[0], near, origin=origin)
+            camera = Camera(viewmat, K.float(), image.shape[1], image.shape[0], self.near, origin=self.origin)
         except ValueError as error:
             raise ValueError(f"{photo.file}: the camera of this image is not usable: {error}") from error
         points = None

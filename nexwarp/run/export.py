@@ -18,7 +18,7 @@ from nexwarp.cameras.similarity import IDENTITY
 from nexwarp.data import Scene, View
 from nexwarp.data.images import image_size
 from nexwarp.data.option import Flag_, option
-from nexwarp.data.scene import DEMO, SceneSource, demo_folder, parse_color
+from nexwarp.data.scene import SceneSource, parse_color
 from nexwarp.data.transforms import lens_keys
 from nexwarp.errors import OutOfMemoryError, RunError, SettingError, check_package, require
 from nexwarp.export.bake import Progress
@@ -407,7 +407,7 @@ def _originals(opened: OpenedModel) -> tuple[dict[str, str], dict[str, JsonObjec
         warnings.warn(f"{source.path}: the scene cannot be read ({one_line(error)}), so {taken}", stacklevel=2)
     if photos is None:
         return {name: f"{source.images}/{name}" for name in opened.views}, {}
-    folder = demo_folder() if source.path == DEMO else Path(source.path)
+    folder = source.folder
     names, lenses = {}, {}
     for name in opened.views:
         photo = photos.get(name)
