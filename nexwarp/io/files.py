@@ -38,17 +38,23 @@ def is_temporary(name: str) -> bool:
     return TEMPORARY.fullmatch(name) is not None
 
 
-def make_folders(folder: Path) -> list[Path]:
-    """Create a folder and those above it, stored on disk; return the new ones, deepest first. Failing, remove them."""
+@contextmanager
+def made_folders(folder: Path) -> Iterator[None]:
+    """Create a folder and those above it, stored on disk; at the end of the block, remove new ones that are empty.
+
+    StorageError: it cannot be created.
+    """
     missing = [f for f in (folder, *folder.parents) if not f.exists()]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for new in missing:
-            sync(new.parent)
-    except OSError:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for new in missing:
+                sync(new.parent)
+        except OSError as error:
+            raise StorageError.at(folder, error) from error
+        yield
+    finally:
         remove_empty(missing)
-        raise
-    return missing
 
 
 def remove_empty(folders: list[Path]) -> None:
@@ -70,26 +76,22 @@ def written_aside(path: str | os.PathLike[str], *, durable: bool = True) -> Iter
     if path.is_dir():
         raise IsADirectoryError(f"{path}: expected a file to write, found a folder")
     temporary = temporary_name(path)
-    created: list[Path] = []
-    try:
-        created = make_folders(path.parent)
-        temporary.touch(exist_ok=False)
-        yield temporary
-        if durable:
-            sync(temporary)
-        os.replace(temporary, path)
-        created = []
-        if durable:
-            sync(path.parent)
-    except OSError as error:
-        # An OSError from write or flush does not name the file.
-        if isinstance(error, StorageError) or error.errno is None or error.filename not in (None, str(temporary)):
-            raise
-        raise StorageError.at(path, error) from error
-    finally:
-        with suppress(NotADirectoryError):  # a parent of `path` is a file
+    with made_folders(path.parent):
+        try:
+            temporary.touch(exist_ok=False)
+            yield temporary
+            if durable:
+                sync(temporary)
+            os.replace(temporary, path)
+            if durable:
+                sync(path.parent)
+        except OSError as error:
+            # An OSError from write or flush does not name the file.
+            if isinstance(error, StorageError) or error.errno is None or error.filename not in (None, str(temporary)):
+                raise
+            raise StorageError.at(path, error) from error
+        finally:
             temporary.unlink(missing_ok=True)
-        remove_empty(created)
 
 
 def write_atomically(path: str | os.PathLike[str], content: bytes, *, durable: bool = True) -> None:

@@ -31,7 +31,7 @@ from nexwarp.cameras.paths import surrounding
 from nexwarp.cameras.similarity import IDENTITY, Similarity
 from nexwarp.data.scene import DEMO, SceneSource
 from nexwarp.errors import FormatError, MissingError, RunError, SettingError, StorageError, check_version
-from nexwarp.io.files import is_temporary, make_folders, one_line, remove_empty, sync, written_aside
+from nexwarp.io.files import is_temporary, made_folders, one_line, remove_empty, sync, written_aside
 from nexwarp.io.json_files import READ_ERRORS, Json, read_json, write_json
 from nexwarp.model.edit import EDIT_FILE, Edit, frame_of, kept_surfels, read_edits, select
 from nexwarp.model.model import Model
@@ -233,11 +233,7 @@ def locked_run(run: Path) -> Iterator[None]:
     locks, a warning says so, and the block runs without.
     """
     lock = FileLock(run / LOCK_FILE, timeout=0, fallback_to_soft=False, on_acquired=_write_holder)
-    try:
-        created = make_folders(run)
-    except OSError as error:
-        raise StorageError.at(run, error) from error
-    try:
+    with made_folders(run):
         _acquire(lock, run)
         try:
             yield
@@ -246,8 +242,6 @@ def locked_run(run: Path) -> Iterator[None]:
                 with suppress(OSError):  # Windows does not delete open files
                     (run / LOCK_FILE).unlink()
                 lock.release()
-    finally:
-        remove_empty(created)
 
 
 def _acquire(lock: BaseFileLock, run: Path) -> None:

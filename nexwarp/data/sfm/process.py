@@ -24,7 +24,7 @@ from nexwarp.data.sfm.frames import check_frames, take_frames
 from nexwarp.data.sfm.photos import SECOND, list_photos
 from nexwarp.data.sfm.report import PYCOLMAP, Observer, SfmOptions, SfmReport
 from nexwarp.errors import OutOfMemoryError, SceneError, StorageError
-from nexwarp.io.files import make_folders, one_line, remove_empty
+from nexwarp.io.files import made_folders, one_line
 from nexwarp.io.json_files import Json, write_json
 from nexwarp.machine import needed_memory
 
@@ -239,19 +239,16 @@ def _check_target(source: Path, scene: Path) -> None:
 @contextmanager
 def _folder_beside(scene: Path) -> Iterator[Path]:
     """Yield a new folder beside `scene`; at the end it is deleted, and so are new folders above it that are empty."""
-    created: list[Path] = []
-    try:
-        created = make_folders(scene.absolute().parent)
-        name = f".{scene.name[:MAX_STEM]}."
-        folder = Path(tempfile.mkdtemp(prefix=name, suffix=".making", dir=scene.absolute().parent))
-    except OSError as error:
-        remove_empty(created)
-        raise StorageError.at(scene, error) from error
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-        remove_empty(created)
+    parent = scene.absolute().parent
+    with made_folders(parent):
+        try:
+            folder = Path(tempfile.mkdtemp(prefix=f".{scene.name[:MAX_STEM]}.", suffix=".making", dir=parent))
+        except OSError as error:
+            raise StorageError.at(scene, error) from error
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _publish(made: Path, scene: Path) -> None:
