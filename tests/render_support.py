@@ -86,7 +86,7 @@ class Passes:
     def gradients(self) -> dict[str, torch.Tensor]:
         """Of the sum of all differentiable buffers with fixed random factors."""
         generator, hits = torch.Generator().manual_seed(2), self.hits
-        surface = ops.surface(self.projection, self.tiles, hits, self.pinhole, self.leaves["viewmat"])
+        surface = ops.surface(self.projection, hits, self.leaves["viewmat"])
         depths = surface.expected_depth, surface.median_depth, surface.top_depth
         buffers = (hits.plain, hits.base, hits.depths, hits.weights, hits.alpha, *depths, surface.blended_normals)
         factors = (torch.randn(x.shape, generator=generator, dtype=torch.float64).to(x) for x in buffers)
@@ -94,7 +94,7 @@ class Passes:
         return {name: present(leaf.grad) for name, leaf in self.leaves.items()}
 
     def blended(self, errors: torch.Tensor) -> torch.Tensor:
-        return ops.splat_error(self.projection, self.tiles, self.hits, self.pinhole, errors).detach()
+        return ops.splat_error(self.hits, errors).detach()
 
 
 def cameras(device: torch.device | str, count: int = 4, width: int = 61, height: int = 45) -> list[nw.Camera]:

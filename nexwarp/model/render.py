@@ -103,7 +103,7 @@ class Rendering:
         stages = self.intermediates
         # It is kept for later uses, so that its gradients must not depend on where the first one is.
         with torch.set_grad_enabled(stages.projection.records.requires_grad):
-            return ops.surface(stages.projection, stages.tiles, stages.hits, stages.pinhole, stages.viewmat)
+            return ops.surface(stages.projection, stages.hits, stages.viewmat)
 
     def request_splat_error(self, errors: torch.Tensor) -> ops.SplatErrorRequest:
         """Request `splat_error(errors)` from the backward pass, which computes it at almost no cost.
@@ -117,8 +117,7 @@ class Rendering:
 
     def splat_error(self, errors: torch.Tensor) -> torch.Tensor:
         """Return each surfel's sum (N,) over pixels of blending weight * errors (H, W). Not differentiable."""
-        stages = self.intermediates
-        return ops.splat_error(stages.projection, stages.tiles, stages.hits, stages.pinhole, errors)
+        return ops.splat_error(self.intermediates.hits, errors)
 
 
 def render(

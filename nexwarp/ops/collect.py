@@ -43,64 +43,6 @@ class SplatErrorRequest:
     sums_after_backward: torch.Tensor | None = None
 
 
-@dataclass(frozen=True)
-class Hits:
-    """Outputs of the collection pass; differentiable but for integers."""
-
-    plain: torch.Tensor  # (H, W, 3) sum of weight * plain colour over the hits outside the buffer (N, paper Eq. 6)
-    base: torch.Tensor  # (H, W, 3) the same sum over the hits in the buffer: their colour without a texture
-    ids: torch.Tensor  # (H, W, K) int32 surfels, heaviest hit first, -1 in empty slots
-    depths: torch.Tensor  # (H, W, K) z-depths in world units, 0 in empty slots
-    weights: torch.Tensor  # (H, W, K), 0 in empty slots
-    alpha: torch.Tensor  # (H, W) 1 - final transmittance
-    stops: torch.Tensor  # (H, W) int32, end of the part of the tile's list that the pixel's walk took
-    error_request: SplatErrorRequest  # empty at first
-    channels: torch.Tensor | None = None  # (H, W, 16) as `plain`, of sixteen more channels
-
-
-def collect(
-    projection: Projection,
-    tiles: Tiles,
-    camera: Pinhole,
-    *,
-    max_hits: int = 2,
-    channels: torch.Tensor | None = None,
-) -> Hits:
-    """Walk every pixel's list front to back; differentiable with respect to the projection's records and `channels`.
-
-    K is `max_hits`, 0 to 8; `channels` (N, 16) are more channels of the plain colour.
-    """
-    if not 0 <= max_hits <= MAX_HITS:
-        raise ValueError(f"max_hits: expected 0 to {MAX_HITS}, got {max_hits}")
-    request = SplatErrorRequest()
-    if channels is not None:
-        check_tensors({"records": (projection.records, ("N", 4, 4)), "channels": (channels, ("N", CHANNELS))})
-        channels = channels.contiguous().view(-1, 4, 4)
-    stored = None if channels is None else channels.detach()
-    scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera, stored)
-    outputs = _Collect.apply(projection.records, channels, scene, max_hits, request)
-    plain, base, ids, depths, weights, alpha, stops, more = outputs
-    more = None if more is None else more.flatten(2)
-    return Hits(plain, base, ids, depths, weights, alpha, stops, request, more)
-
-
-def splat_error(
-    projection: Projection, tiles: Tiles, hits: Hits, camera: Pinhole, errors: torch.Tensor
-) -> torch.Tensor:
-    """Return each surfel's sum (N,) over pixels of blending weight * errors (H, W) >= 0. Not differentiable.
-
-    Hits are those of `collect`, whose arguments the others are.
-    """
-    check_tensors({"errors": (errors, (camera.height, camera.width))}, device=projection.records.device)
-    scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera)
-    buffers = (hits.plain, hits.base, hits.ids, hits.depths, hits.weights, hits.alpha, hits.stops)
-    outputs = tuple(x.detach() for x in buffers)
-    errors = errors.detach().to(scene.records.dtype).contiguous()
-    _, sums, _ = _backward(scene, (*outputs, None), (*map(torch.zeros_like, outputs), None), errors)
-    assert sums is not None
-    return sums
-
-
 class Walked(NamedTuple):
     """What a walk along rays reads: records (N, 4, 4) and limits (N,) of the surfels, their lists, the image plane.
 
@@ -128,6 +70,59 @@ class Walked(NamedTuple):
         sharing = Sharing(smallest=pixels, align=pixels, even=False)
         everything = [*self.arguments(), *arguments]
         launch(self.records, kernel, threads, everything, [], block_dim=BLOCK_DIM, sharing=sharing, **names)
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Outputs of the collection pass; differentiable but for integers."""
+
+    plain: torch.Tensor  # (H, W, 3) sum of weight * plain colour over the hits outside the buffer (N, paper Eq. 6)
+    base: torch.Tensor  # (H, W, 3) the same sum over the hits in the buffer: their colour without a texture
+    ids: torch.Tensor  # (H, W, K) int32 surfels, heaviest hit first, -1 in empty slots
+    depths: torch.Tensor  # (H, W, K) z-depths in world units, 0 in empty slots
+    weights: torch.Tensor  # (H, W, K), 0 in empty slots
+    alpha: torch.Tensor  # (H, W) 1 - final transmittance
+    stops: torch.Tensor  # (H, W) int32, end of the part of the tile's list that the pixel's walk took
+    scene: Walked  # what was walked along
+    error_request: SplatErrorRequest  # empty at first
+    channels: torch.Tensor | None = None  # (H, W, 16) as `plain`, of sixteen more channels
+
+
+def collect(
+    projection: Projection,
+    tiles: Tiles,
+    camera: Pinhole,
+    *,
+    max_hits: int = 2,
+    channels: torch.Tensor | None = None,
+) -> Hits:
+    """Walk every pixel's list front to back; differentiable with respect to the projection's records and `channels`.
+
+    K is `max_hits`, 0 to 8; `channels` (N, 16) are more channels of the plain colour.
+    """
+    if not 0 <= max_hits <= MAX_HITS:
+        raise ValueError(f"max_hits: expected 0 to {MAX_HITS}, got {max_hits}")
+    request = SplatErrorRequest()
+    if channels is not None:
+        check_tensors({"records": (projection.records, ("N", 4, 4)), "channels": (channels, ("N", CHANNELS))})
+        channels = channels.contiguous().view(-1, 4, 4)
+    stored = None if channels is None else channels.detach()
+    scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera, stored)
+    outputs = _Collect.apply(projection.records, channels, scene, max_hits, request)
+    plain, base, ids, depths, weights, alpha, stops, more = outputs
+    more = None if more is None else more.flatten(2)
+    return Hits(plain, base, ids, depths, weights, alpha, stops, scene, request, more)
+
+
+def splat_error(hits: Hits, errors: torch.Tensor) -> torch.Tensor:
+    """Return each surfel's sum (N,) over pixels of blending weight * errors (H, W) >= 0. Not differentiable."""
+    check_tensors({"errors": (errors, hits.alpha.shape)}, device=hits.alpha.device)
+    buffers = (hits.plain, hits.base, hits.ids, hits.depths, hits.weights, hits.alpha, hits.stops)
+    outputs = tuple(x.detach() for x in buffers)
+    errors = errors.detach().to(hits.alpha.dtype).contiguous()
+    _, sums, _ = _backward(hits.scene, (*outputs, None), (*map(torch.zeros_like, outputs), None), errors)
+    assert sums is not None
+    return sums
 
 
 class SlotSums:

@@ -7,8 +7,7 @@ import torch
 from nexwarp.kernels import surface as kernels
 from nexwarp.ops._interop import Context, contiguous, first_derivative
 from nexwarp.ops.collect import Hits, SlotSums, Walked
-from nexwarp.ops.project import Pinhole, Projection
-from nexwarp.ops.tiles import Tiles
+from nexwarp.ops.project import Projection
 
 
 @dataclass(frozen=True)
@@ -28,17 +27,14 @@ class DifferentiableSurface(Surface):
     blended_normals: torch.Tensor  # (H, W, 3), not normalised
 
 
-def surface(
-    projection: Projection, tiles: Tiles, hits: Hits, camera: Pinhole, viewmat: torch.Tensor
-) -> DifferentiableSurface:
+def surface(projection: Projection, hits: Hits, viewmat: torch.Tensor) -> DifferentiableSurface:
     """Walk every pixel's list once more, for what the K-buffer does not hold.
 
     Differentiable with respect to the projection and `viewmat`. The gradient of the median and of the top depth is that
     of the depth of the hit that they are taken from: which one it is, is piecewise constant. Hits are those of
-    `collect`, whose arguments the others are; `viewmat` (4, 4) is world to camera.
+    `collect` for the projection; `viewmat` (4, 4) is world to camera.
     """
-    scene = Walked(projection.records.detach().contiguous(), projection.limits, tiles, camera)
-    expected, median, top, sums = walk_surface(projection.records, scene, hits.stops)
+    expected, median, top, sums = walk_surface(projection.records, hits.scene, hits.stops)
     with torch.autocast(sums.device.type, enabled=False):
         blended = sums @ viewmat[:3, :3].to(sums)
         normals = torch.nn.functional.normalize(blended, dim=-1)

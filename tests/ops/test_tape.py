@@ -70,7 +70,7 @@ def test_tape_and_torch_give_the_same_gradients_of_a_surface(device: torch.devic
     given = (means, quats, scales, opacities, gammas)
     projection = ops.project(*given, torch.zeros_like(means), viewmat)
     tiles = ops.intersect_tiles(given, projection, viewmat, pinhole)
-    found = ops.surface(projection, tiles, ops.collect(projection, tiles, pinhole), pinhole, viewmat.detach())
+    found = ops.surface(projection, ops.collect(projection, tiles, pinhole), viewmat.detach())
     normals = found.blended_normals @ viewmat[:3, :3].detach().T  # back to the camera's frame
     buffers = [found.expected_depth, found.median_depth, found.top_depth, normals]
     cotangents = [torch.randn_like(x) for x in buffers]
