@@ -373,17 +373,19 @@ class ViewCommand:
             display.warn(console, f"{error}; the viewer lists no photos")
             figures_of_photos = {}
         model = opened.model.to(pick_device(self.device))
-        with Viewer(
-            lambda: model,
-            opened.cameras,
-            ViewerOptions(near_depth(model), opened.title, self.host, self.port),
+        options = ViewerOptions(
+            near_depth(model),
+            opened.title,
+            self.host,
+            self.port,
             save_path=partial(
                 keep_camera_path, opened.folder, opened=self.run, origin=model.origin, frame=opened.frame
             ),
             crop_command=partial(crop_command, opened),
             measured=partial(measured, opened),
             figures=figures_of_photos,
-        ) as viewer:
+        )
+        with Viewer(lambda: model, opened.cameras, options) as viewer:
             show_until_interrupted(viewer, console)
 
 

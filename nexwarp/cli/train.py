@@ -264,12 +264,9 @@ class Train:
         from nexwarp.viewer import Viewer, ViewerOptions
 
         camera, iterations = scene.train[0].camera, record.config.iterations
-        viewer = Viewer(
-            lambda: runner.trainer.model(),
-            scene.cameras,
-            ViewerOptions(camera.near, record.source.name, self.host, self.port, iterations),
-            save_path=partial(keep_camera_path, run, origin=camera.origin),
-        )
+        save_path = partial(keep_camera_path, run, origin=camera.origin)
+        options = ViewerOptions(camera.near, record.source.name, self.host, self.port, iterations, save_path)
+        viewer = Viewer(lambda: runner.trainer.model(), scene.cameras, options)
         console.print(f"viewer: {viewer.url}")
         return viewer
 

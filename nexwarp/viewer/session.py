@@ -283,7 +283,7 @@ class Session:
     """The state of a client. viser's event loop calls its methods; another thread draws its pictures."""
 
     def __init__(self, viewer: "Viewer", client: "viser.ClientHandle") -> None:
-        self.viewer, self.client = viewer, client
+        self.viewer, self.client, self.options = viewer, client, viewer.options
         self.settings = Settings(max_hits=viewer.model().options.max_hits)
         self.world, self.cameras, self.home = viewer.world, viewer.cameras, viewer.home
         self.viewpoint: Viewpoint | None = None
@@ -300,7 +300,7 @@ class Session:
         for label, add in (("Look", self._look), ("Cameras", self._cameras), ("Record", self._record)):
             with tabs.add_tab(label):
                 add()
-        if viewer.crop_command is not None or viewer.measured is not None:
+        if self.options.crop_command is not None or self.options.measured is not None:
             with tabs.add_tab("Edit"):
                 self._edit()
         gui.add_divider(order=15.0)
@@ -449,9 +449,9 @@ class Session:
         add_button(gui, "Go there", "camera", lambda: self.jump(jump.value))
         visible = gui.add_checkbox("Show cameras", True, hint="Blue: training views. Orange: test views.")
         on_change(visible, lambda shown: set_changed(self.group, "visible", bool(shown)))
-        if self.viewer.figures:
+        if self.options.figures:
             with gui.add_folder("Photos"):
-                self._photos(self.viewer.figures)
+                self._photos(self.options.figures)
 
     def _photos(self, figures: Mapping[str, tuple[float, float]]) -> None:
         """Add the list of the worst photos: a choice goes to the camera, and shows how to leave the photo out."""
@@ -483,16 +483,16 @@ class Session:
         height = gui.add_number("Height", 1080, min=SCREENSHOT_HEIGHTS[0], max=SCREENSHOT_HEIGHTS[1], step=1)
         hint = "The width follows from the shape of the window"
         add_button(gui, "Save screenshot", "photo", lambda: self._take_screenshot(height.value), hint=hint)
-        if self.viewer.save_path is not None:
+        if self.options.save_path is not None:
             gui.add_divider()
-            self.path = PathEditor(self, self.viewer.save_path)
+            self.path = PathEditor(self, self.options.save_path)
 
     def _edit(self) -> None:
-        if self.viewer.measured is not None:
-            self.measure = MeasureEditor(self, self.viewer.measured)
+        if self.options.measured is not None:
+            self.measure = MeasureEditor(self, self.options.measured)
             self.client.gui.add_divider()
-        if self.viewer.crop_command is not None:
-            self.crop = CropEditor(self, self.viewer.crop_command)
+        if self.options.crop_command is not None:
+            self.crop = CropEditor(self, self.options.crop_command)
 
     def _take_screenshot(self, height: float) -> None:
         """Request a picture of this height in pixels, in place of one that is not drawn yet."""

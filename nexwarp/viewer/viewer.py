@@ -38,13 +38,20 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ViewerOptions:
-    """Options of a viewer."""
+    """Options of a viewer, and what it offers for the run that it shows: nothing where that is None."""
 
     near: float  # near depth of the viewer's cameras, world units
     title: str = "nexwarp"  # text above the panel
     host: str = "127.0.0.1"  # interface to listen on
     port: int = 8080  # 0 is any free port
     total: int | None = None  # iterations of the training that is shown; None for a finished model
+    # Writes a camera path into the run and returns the command that renders it.
+    save_path: Callable[[Sequence[Camera]], str] | None = None
+    # Returns the command that crops by a sphere, of its centre (3,) and radius.
+    crop_command: Callable[[np.ndarray, float], str] | None = None
+    # Returns lines that describe one or two points (N, 3), and the command that makes their distance a given length.
+    measured: Callable[[np.ndarray, float], list[str]] | None = None
+    figures: Mapping[str, tuple[float, float]] | None = None  # "set/name" -> PSNR [dB], sharpness; worst photo first
 
 
 class Viewer:
@@ -55,11 +62,6 @@ class Viewer:
         model: Callable[[], Model],
         cameras: Mapping[str, Mapping[str, Camera]],
         options: ViewerOptions,
-        *,
-        save_path: Callable[[Sequence[Camera]], str] | None = None,
-        crop_command: Callable[[np.ndarray, float], str] | None = None,
-        measured: Callable[[np.ndarray, float], list[str]] | None = None,
-        figures: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         """Start the server. ValueError: the package viser is missing, or the address cannot be used.
 
@@ -67,14 +69,8 @@ class Viewer:
             model: returns the current model; called for each picture.
             cameras: the scene's cameras by set ("train", "test") and name; may be empty.
             options: title, address and the like.
-            save_path: writes a camera path into the run and returns the command that renders it; None offers none.
-            crop_command: returns the command that crops by a sphere, of its centre (3,) and radius; None offers none.
-            figures: "set/name" -> PSNR in dB and sharpness of a photo, the worst first; None lists no photos.
-            measured: returns lines that describe one or two points (N, 3), and the command that makes their distance a
-                given length; None offers no measuring.
         """
-        self.model, self.options, self.save_path = model, options, save_path
-        self.crop_command, self.measured, self.figures = crop_command, measured, figures or {}
+        self.model, self.options = model, options
         self.cameras = {f"{group}/{name}": camera for group, views in cameras.items() for name, camera in views.items()}
         means = model().surfels.means
         placed = list(self.cameras.values()) or surrounding(means, options.near)

@@ -109,7 +109,8 @@ def shown(viewer: Viewer) -> Iterator[None]:
 def serving(model: nw.Model, host: str = "127.0.0.1", **arguments: Any) -> Iterator[Viewer]:
     """A viewer of a model that draws."""
     pytest.importorskip("viser")
-    with Viewer(lambda: model, ring(), ViewerOptions(0.01, host=host, port=0), **arguments) as viewer, shown(viewer):
+    options = ViewerOptions(0.01, host=host, port=0, **arguments)
+    with Viewer(lambda: model, ring(), options) as viewer, shown(viewer):
         yield viewer
 
 

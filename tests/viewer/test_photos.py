@@ -33,7 +33,9 @@ def test_damaged_tables_are_refused_in_one_line(tmp_path, content):
 def test_a_run_is_viewed_with_its_photos_or_a_warning(run, monkeypatch, capsys):
     pytest.importorskip("viser")
     listed = []
-    monkeypatch.setattr(commands, "show_until_interrupted", lambda viewer, _: listed.append(list(viewer.figures)))
+    monkeypatch.setattr(
+        commands, "show_until_interrupted", lambda viewer, _: listed.append(list(viewer.options.figures))
+    )
     good = (run / PHOTOS_FILE).read_bytes()
     view = ["view", str(run), "--port", "0", "--device", "cpu"]
     for content in (good, b"damaged"):
