@@ -123,7 +123,6 @@ class Eval:
     """Evaluate a run on the test views of its scene, or a model on those of --scene."""
 
     run: Run_
-    """Run folder, or a model's folder or .safetensors file."""
     scene: Annotated[str | None, option("SCENE", "the folder of the training")] = None
     """Folder of the scene, if it has moved; required for a model alone."""
     metrics: Annotated[tuple[str, ...], option("{psnr,ssim,flip,lpips} ...", "psnr ssim")] = ("psnr", "ssim")
@@ -201,7 +200,6 @@ class Render:
     """
 
     run: Run_
-    """Run folder, or a model's folder or .safetensors file."""
     pictures: tyro.conf.OmitArgPrefixes[RenderOrder] = dataclasses.field(default_factory=RenderOrder)
     device: Device_ = None
     """Device to render on."""
@@ -235,7 +233,6 @@ class Export:
     """
 
     run: Run_
-    """Run folder, or a model's folder or .safetensors file."""
     files: tyro.conf.OmitArgPrefixes[ExportOrder] = dataclasses.field(default_factory=ExportOrder)
     device: Device_ = None
     """Device for mesh, web, glb and usd, which render."""
@@ -264,7 +261,6 @@ class Edit:
     """
 
     run: Run_
-    """Run folder, or a model's folder or .safetensors file."""
     order: tyro.conf.OmitArgPrefixes[EditOrder] = dataclasses.field(default_factory=EditOrder)
     device: Device_ = None
     """Device for --remove-floaters, which renders."""
@@ -306,7 +302,6 @@ class Info:
     """Print a summary of a run or a model."""
 
     run: Run_
-    """Run folder, or a model's folder or .safetensors file."""
 
     def __call__(self, console: Console) -> None:
         """Print the summary."""
@@ -353,7 +348,6 @@ class ViewCommand:
     """Show a run or a model in the browser, with all buffers and an editor of camera paths (extra `viewer`)."""
 
     run: Run_
-    """Run folder, or a model's folder or .safetensors file."""
     host: Host_ = "127.0.0.1"
     """Address to listen on; 0.0.0.0 allows other machines, with the token of the URL that is printed."""
     port: Port_ = 8080

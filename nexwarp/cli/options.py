@@ -16,7 +16,9 @@ from nexwarp.errors import RankError, SettingError, require
 from nexwarp.kernels.launch import get_num_threads, set_num_threads
 from nexwarp.train.ranks.ranks import Ranks, is_rank
 
-Run_ = Annotated[Path, tyro.conf.Positional, option("RUN")]
+Run_ = Annotated[
+    Path, tyro.conf.Positional, option("RUN", text="Run folder, or a model's folder or .safetensors file.")
+]
 Device_ = Annotated[str | None, option("{cuda,cpu}", "cuda if there is one")]
 Preset_ = Annotated[str, option("NAME")]
 Port_ = Annotated[int, option("PORT")]
