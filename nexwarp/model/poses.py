@@ -81,16 +81,16 @@ class PoseCorrections(nn.Module):
         self.register_buffer("gauge", _gauge_directions(cameras, pivots, scale).float().contiguous(), persistent=False)
         self.register_buffer("pivots", pivots.float().contiguous(), persistent=False)
 
-    def viewmat(self, given: torch.Tensor, view: int | torch.Tensor) -> torch.Tensor:
-        """Return the corrected viewmat (4, 4) of a view, a number or a (1,) int64 tensor; differentiable."""
-        twist = _row(self.corrections, view)
-        return corrected(given, torch.cat([twist[:3], self.scale * twist[3:]]), _row(self.pivots, view))
-
     def camera(self, given: Camera, view: int | torch.Tensor) -> Camera:
-        """Return the corrected camera of a view, whose image may have been cropped or reduced; differentiable."""
-        corrected = copy.copy(given)  # of its own class: a staged camera has its focal length on the device
-        vars(corrected)["viewmat"] = self.viewmat(given.viewmat, view)
-        return corrected
+        """Return the corrected camera of a view, a number or a (1,) int64 tensor; differentiable.
+
+        Its image may have been cropped or reduced.
+        """
+        turn, shift = _row(self.corrections, view).split(3)
+        twist = torch.cat([turn, self.scale * shift])
+        camera = copy.copy(given)  # of its own class: a staged camera has its focal length on the device
+        vars(camera)["viewmat"] = corrected(given.viewmat, twist, _row(self.pivots, view))
+        return camera
 
     @torch.no_grad()
     def cameras(self, given: Sequence[Camera]) -> list[Camera]:
