@@ -74,9 +74,9 @@ class Exposures(nn.Module):
         for name in SHAPES:
             self.register_buffer(name, buffers[name])
         self._read_falloff()
-        self.register_load_state_dict_post_hook(_read_falloff_again)  # no lambda: models can be pickled
+        self.register_load_state_dict_post_hook(Exposures._read_falloff)  # no lambda: models can be pickled
 
-    def _read_falloff(self) -> None:
+    def _read_falloff(self, *_: object) -> None:
         """Copy the falloff to Python numbers, so that renderings do not wait for the GPU."""
         a, b, largest = self.falloff.tolist()
         if not largest > 0:
@@ -153,10 +153,6 @@ class Exposures(nn.Module):
                 self._falloffs.clear()
             falloff = self._falloffs[key] = (t * (a + b * t)).exp()[..., None]
         return falloff
-
-
-def _read_falloff_again(exposures: Exposures, _: object) -> None:
-    exposures._read_falloff()
 
 
 def matern_kernel(squares: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
