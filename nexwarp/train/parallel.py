@@ -148,7 +148,7 @@ class ParallelTrainer(Trainer):
             fault = error
         sums = [x.detach().view(torch.int32).sum(dtype=torch.int64) for _, x in self._named_parameters()]
         mine = {"fault": None if fault is None else str(fault), "sums": torch.stack(sums).tolist()}
-        records: list[Any] = self.ranks.gather(mine)
+        records = self.ranks.gather(mine)
         for rank, record in enumerate(records):
             if record["fault"] is not None:
                 raise DivergedError(record["fault"])
@@ -167,7 +167,6 @@ class ParallelTrainer(Trainer):
         snapshot = super()._read(run, warn) if self.ranks.first else None
         content = None if snapshot is None else save(snapshot.tensors)
         state = self.ranks.share(None if snapshot is None else snapshot.state)
-        assert isinstance(state, dict)
         return Snapshot(load(self.ranks.share_bytes(content)), state)
 
     def load_snapshot(self, snapshot: Snapshot) -> None:

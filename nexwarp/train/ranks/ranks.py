@@ -21,6 +21,7 @@ from contextlib import suppress
 from datetime import timedelta
 from tempfile import TemporaryDirectory
 from types import TracebackType
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -141,7 +142,7 @@ class Ranks:
         dist.broadcast(data, 0, group=self.control)
         return data.numpy().tobytes()
 
-    def share(self, value: object) -> object:
+    def share(self, value: object) -> Any:
         """Return the JSON value that rank 0 gives; the others' is ignored."""
         return json.loads(self.share_bytes(json.dumps(value).encode())) if self.size > 1 else value
 
@@ -157,19 +158,17 @@ class Ranks:
         dist.all_gather(padded, mine, group=self.control)
         return [x[: int(size)].numpy().tobytes() for x, size in zip(padded, sizes, strict=True)]
 
-    def gather(self, value: object) -> list[object]:
+    def gather(self, value: object) -> list[Any]:
         """Return the JSON value of each rank, on all ranks."""
         return [json.loads(content) for content in self.gather_bytes(json.dumps(value).encode())]
 
     def check_same(self, facts: dict[str, str]) -> None:
         """Raise RankError, the same one on all ranks, unless each fact is the same on all of them."""
-        for rank, theirs in enumerate(self.gather(list(facts.values()))):
-            assert isinstance(theirs, list)
-            if rank == 0:
-                reference = theirs
-            for name, expected, value in zip(facts, reference, theirs, strict=True):
-                if value != expected:
-                    raise RankError(f"rank {rank}: expected the same {name} as rank 0, {expected}, got {value}")
+        first, *others = self.gather(facts)
+        for rank, theirs in enumerate(others, 1):
+            for name, expected in first.items():
+                if theirs[name] != expected:
+                    raise RankError(f"rank {rank}: expected the same {name} as rank 0, {expected}, got {theirs[name]}")
 
     def share_tensors(self, tensors: Iterable[torch.Tensor]) -> None:
         """Overwrite tensors, which are on the ranks' devices, with those of rank 0."""
