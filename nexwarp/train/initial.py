@@ -72,9 +72,8 @@ def check_scale(name: str, model: Model, scene: Scene) -> None:
 
 def given_surfels(config: Config, start: Start) -> Surfels | None:
     """Return a copy of the surfels to start from, with the SH coefficients of the run; None where none are given."""
-    init, surfels = start.get("init"), start.get("surfels")
-    if init is not None:
-        surfels = init.surfels
+    init = start.get("init")
+    surfels = start.get("surfels") if init is None else init.surfels
     if surfels is None:
         return None
     raw = {name: x.detach().float().clone() for name, x in surfels.state_dict().items()}

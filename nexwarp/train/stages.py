@@ -122,7 +122,7 @@ class StageStore:
     Iterations are reported counted over all stages.
     """
 
-    def __init__(self, observe: Observer | None = None) -> None:
+    def __init__(self, observe: Observer = lambda _: None) -> None:
         self.observe = observe
 
     def complete(self, stage: Stage) -> Model | None:
@@ -134,10 +134,9 @@ class StageStore:
 
     def train(self, stage: Stage, trainer: Trainer) -> None:
         """Do all steps of a stage."""
-        trainer.run(self.observe and partial(self._report, stage.before))
+        trainer.run(partial(self._report, stage.before))
 
     def _report(self, before: int, report: StepReport) -> None:
-        assert self.observe is not None
         self.observe(dataclasses.replace(report, iteration=report.iteration + before) if before else report)
 
     def finish(self, stage: Stage, trainer: Trainer) -> Model:
