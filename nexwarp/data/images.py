@@ -91,7 +91,7 @@ class _Bounded(io.BufferedReader):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(path))
+        super().__init__(io.FileIO(str(path)))
         self._size, self._reads = os.fstat(self.fileno()).st_size, 0
 
     def read(self, size: int | None = -1, /) -> bytes:
@@ -106,8 +106,6 @@ def _opened(path: Path) -> Iterator["PIL.Image.Image"]:
     """Open an image with PIL; errors in the block, too, become a ValueError of one line."""
     from PIL import Image, UnidentifiedImageError
 
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: image not found, but the COLMAP model names it")
     try:
         with _Bounded(path) as file, Image.open(file, formats=decodable_formats()) as image:
             # PIL's own check can be disabled by other libraries.
@@ -118,7 +116,7 @@ def _opened(path: Path) -> Iterator["PIL.Image.Image"]:
                 raise ValueError(f"{image.width}x{image.height} pixels are more than a file of this size holds")
             _check_numbers(path, image)
             yield image
-    except FormatError:
+    except (FormatError, FileNotFoundError):
         raise
     except Image.DecompressionBombError:
         raise ValueError(

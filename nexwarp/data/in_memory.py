@@ -40,11 +40,10 @@ def split_views(
         for index in range(len(images))
     ]
     views.sort(key=lambda view: view.name)
-    tests = [test_every > 0 and index % test_every == 0 for index in range(len(views))]
-    train = [view for view, test in zip(views, tests, strict=True) if not test]
+    train = [view for index, view in enumerate(views) if not test_every or index % test_every]
     if not train:
         raise ValueError(f"test_every: expected 0 for {len(views)} image, which else is a test view, got {test_every}")
-    return train, [view for view, test in zip(views, tests, strict=True) if test]
+    return train, views[::test_every] if test_every else []
 
 
 def make_cloud(points: Array, colors: Array | None) -> Cloud:

@@ -117,7 +117,7 @@ def _read_frames(file: Path, images: str, follow_links: bool, skip_missing: bool
         if photo_file is None:
             frames.missing.append(named)
             continue
-        name = _view_name(str(PurePosixPath(named).with_name(photo_file.name)))
+        name = str(PurePosixPath(named).with_name(photo_file.name)).removeprefix("images/")
         folder = file.parent / images if PurePosixPath(named).is_relative_to("images") else file.parent
         inside_folder(f"{where}: file_path", photo_file, folder, follow_links)
         test = place.startswith("test") if has_tests else None
@@ -158,16 +158,12 @@ def _file_name(where: str, key: str, value: Json, folder: Path) -> str:
     return safe_name(f"{where}: {key}:", value, "scene's folder", folder)
 
 
-def _view_name(named: str) -> str:
-    return named[7:] if named.startswith("images/") else named
-
-
 def _find(where: str, folder: Path, named: str, images: str) -> Path | None:
     """Find an image file, in the folder `images` and with an extension if the name has none; None if there is none."""
     if images != "images":
         if "/" in named and not named.startswith("images/"):
             raise ValueError(f"images: {where} is in no folder images, so {images!r} cannot stand in for it")
-        named = f"{images}/{_view_name(named)}"
+        named = f"{images}/{named.removeprefix('images/')}"
     # ScanNet++ names photos without their folder.
     names = [base + extension for base in (named, f"{images}/{named}") for extension in ("", *EXTENSIONS)]
     files = (find_file(folder, name) for name in names)
@@ -178,7 +174,7 @@ def _split(frames: _Frames) -> list[Photo]:
     """Return the photos in use, split by the file's lists of names if it has any."""
 
     def forms(name: str) -> set[str]:
-        plain = plain_name(_view_name(name))
+        plain = plain_name(name.removeprefix("images/"))
         return {plain, str(PurePosixPath(plain).with_suffix(""))}
 
     names_of = {photo.name: forms(photo.name) for photo in frames.photos}
@@ -190,8 +186,8 @@ def _split(frames: _Frames) -> list[Photo]:
             continue
         if not isinstance(names, list):
             raise ValueError(f"{frames.file}: {key}: expected a list of file names, got {short(names)}")
-        folder = frames.file.parent
-        lists[key] = {plain_name(_view_name(_file_name(str(frames.file), key, name, folder))) for name in names}
+        paths = (_file_name(str(frames.file), key, name, frames.file.parent) for name in names)
+        lists[key] = {plain_name(path.removeprefix("images/")) for path in paths}
         unknown = sorted(lists[key] - known)
         if unknown:
             raise ValueError(f"{frames.file}: {key}: expected photos of the frames, got {unknown[0]}")
