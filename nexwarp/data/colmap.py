@@ -180,19 +180,14 @@ def _without_strays(points: PointRecords, images: dict[int, ImageRecord], folder
 
 def _seen(points: PointRecords, images: dict[int, ImageRecord]) -> list[np.ndarray]:
     """For each image, the ascending indices (M,) of the points that were triangulated from it."""
-    count = len(points.table)
-    identities = np.array(list(images), np.int64)
-    ascending = np.argsort(identities)
-    # Observations are the largest arrays of a model, so they are processed in place.
-    pairs = np.searchsorted(identities[ascending].astype(np.uint32), points.seen_by)
-    # Sort by image, then by point, and remove duplicates.
-    pairs *= count
-    pairs += points.points
-    pairs.sort()
-    pairs = pairs[np.concatenate([[True], pairs[1:] != pairs[:-1]])[: len(pairs)]]
-    ends = np.searchsorted(pairs, np.arange(1, len(identities)) * count)
-    seen = [part % count for part in np.split(pairs, ends)]
-    return [seen[index] for index in np.argsort(ascending)]
+    from scipy.sparse import coo_matrix
+
+    identities = np.array(list(images), np.uint32)
+    ascending = np.argsort(identities).astype(np.int32)
+    rows = ascending[np.searchsorted(identities, points.seen_by, sorter=ascending)]
+    shape = len(images), len(points.table)
+    seen = coo_matrix((np.ones(len(rows), bool), (rows, points.points)), shape).tocsr()  # sorted, without duplicates
+    return np.split(seen.indices, seen.indptr[1:-1])
 
 
 def _cloud(table: np.ndarray, folder: Path) -> Cloud:
