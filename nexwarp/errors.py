@@ -96,6 +96,13 @@ def check_package(needed_for: str, package: str, extra: str) -> None:
     require(found, f"{needed_for}: needs the package {package}, found none; pip install 'nexwarp[{extra}]'")
 
 
+def check_type(name: str, value: object, kind: type, *, optional: bool = False) -> None:
+    """Raise TypeError unless a value is of a public class, or None where it is `optional`."""
+    if not isinstance(value, kind) and not (optional and value is None):
+        expected = f"a nexwarp.{kind.__name__}{' or None' if optional else ''}"
+        raise TypeError(f"{name}: expected {expected}, got {type(value).__name__}")
+
+
 def check_tensors(
     tensors: Mapping[str, tuple[torch.Tensor, tuple[int | str, ...]]],
     *,

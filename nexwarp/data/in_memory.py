@@ -11,7 +11,7 @@ from nexwarp.cameras.camera import Array, Camera
 from nexwarp.cameras.cameras_file import WORLD
 from nexwarp.data.capture import LARGEST_COORDINATE, LOST_PIXELS, Cloud, far_origin, safe_name
 from nexwarp.data.views import View
-from nexwarp.errors import check_range, check_tensors, check_values
+from nexwarp.errors import check_range, check_tensors, check_type, check_values
 
 
 def split_views(
@@ -104,8 +104,7 @@ def _view(index: int, image: Array, camera: Camera, mask: Array | None, name: st
     pixels = as_bytes(f"images[{index}]", image)
     if pixels.ndim != 3 or pixels.shape[-1] != 3 or not pixels.numel():
         raise ValueError(f"images[{index}]: expected shape (H, W, 3), got {tuple(pixels.shape)}")
-    if not isinstance(camera, Camera):
-        raise TypeError(f"cameras[{index}]: expected a nexwarp.Camera, got {type(camera).__name__}")
+    check_type(f"cameras[{index}]", camera, Camera)
     height, width = pixels.shape[:2]
     if (camera.width, camera.height) != (width, height):
         raise ValueError(

@@ -12,6 +12,7 @@ from typing_extensions import Unpack
 from nexwarp.cameras.camera import Camera
 from nexwarp.cameras.cameras_file import WORLD, origin_of
 from nexwarp.cameras.ray_camera import RayCamera
+from nexwarp.errors import check_type
 from nexwarp.io.json_files import Json
 from nexwarp.model import graphs
 from nexwarp.model.exposures import Exposures
@@ -56,16 +57,11 @@ class Model(nn.Module):
         meta: Mapping[str, Json] | None = None,
     ) -> None:
         super().__init__()
-        if not isinstance(surfels, Surfels):
-            raise TypeError(f"surfels: expected a nexwarp.Surfels, got {type(surfels).__name__}")
-        for name, value, kind in (
-            ("texture", texture, Texture),
-            ("exposures", exposures, Exposures),
-            ("detail_limits", detail_limits, DetailLimits),
-            ("options", options, RenderOptions),
-        ):
-            if value is not None and not isinstance(value, kind):
-                raise TypeError(f"{name}: expected a nexwarp.{kind.__name__} or None, got {type(value).__name__}")
+        check_type("surfels", surfels, Surfels)
+        check_type("texture", texture, Texture, optional=True)
+        check_type("exposures", exposures, Exposures, optional=True)
+        check_type("detail_limits", detail_limits, DetailLimits, optional=True)
+        check_type("options", options, RenderOptions, optional=True)
         if detail_limits is not None and len(detail_limits) != len(surfels):
             raise ValueError(f"detail_limits: expected limits of {len(surfels)} surfels, got {len(detail_limits)}")
         self.surfels = surfels
@@ -147,8 +143,7 @@ class Model(nn.Module):
         """
         if torch.compiler.is_compiling():
             return torch.compiler.disable(self.render_image)(camera, background=background, **changes)
-        if not isinstance(camera, Camera):
-            raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
+        check_type("camera", camera, Camera)
         with torch.no_grad():
             return graphs.render(self._frame(camera, background, changes), whole=False).image
 

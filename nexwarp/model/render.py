@@ -7,7 +7,7 @@ import torch
 
 from nexwarp import ops
 from nexwarp.cameras.camera import Camera
-from nexwarp.errors import OutOfMemoryError, check_tensors
+from nexwarp.errors import OutOfMemoryError, check_tensors, check_type
 from nexwarp.machine import keep_freed_memory, needed_memory
 from nexwarp.model.exposures import Exposures
 from nexwarp.model.options import Color, RenderOptions, color_tensor
@@ -155,12 +155,9 @@ def render(
         return torch.compiler.disable(render)(
             surfels, texture, camera, max_hits, background, sh_degree, clamp_texture, order
         )
-    if not isinstance(surfels, Surfels):
-        raise TypeError(f"surfels: expected a nexwarp.Surfels, got {type(surfels).__name__}")
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera: expected a nexwarp.Camera, got {type(camera).__name__}")
-    if texture is not None and not isinstance(texture, Texture):
-        raise TypeError(f"texture: expected a nexwarp.Texture or None, got {type(texture).__name__}")
+    check_type("surfels", surfels, Surfels)
+    check_type("camera", camera, Camera)
+    check_type("texture", texture, Texture, optional=True)
     if background is None:
         raise TypeError("background: expected numbers or a tensor, got None")
     options = RenderOptions(max_hits, sh_degree=sh_degree, clamp_texture=clamp_texture, order=order)

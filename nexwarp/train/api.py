@@ -6,6 +6,7 @@ import torch
 from typing_extensions import Unpack
 
 from nexwarp.data import Scene
+from nexwarp.errors import check_type
 from nexwarp.model.model import Model
 from nexwarp.train.initial import Start, check_start
 from nexwarp.train.losses import OwnLoss
@@ -62,10 +63,8 @@ def train(
         DivergedError: numbers are not finite.
         OutOfMemoryError: memory does not suffice; the message says what to lower.
     """
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene: expected a nexwarp.Scene, got {type(scene).__name__}")
-    if config is not None and not isinstance(config, Config):
-        raise TypeError(f"config: expected a nexwarp.Config or None, got {type(config).__name__}")
+    check_type("scene", scene, Scene)
+    check_type("config", config, Config, optional=True)
     config, observers = config or Config(), list(callbacks)
     for index, callback in enumerate(observers):
         if not callable(callback):

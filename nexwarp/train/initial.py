@@ -12,6 +12,7 @@ import torch
 from nexwarp.cameras.camera import in_image
 from nexwarp.data import InitialPoints, Scene, View, initial_points
 from nexwarp.data.skybox import skybox_points
+from nexwarp.errors import check_type
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.machine import in_threads
 from nexwarp.model.bounds import check_bounds
@@ -38,13 +39,12 @@ class Start(TypedDict, total=False):
 
 def check_start(scene: Scene, config: Config, start: Start) -> None:
     """Raise TypeError or ValueError where what a training is to start from does not fit it."""
-    for name, value in start.items():
+    for name in start:
         if name not in Start.__annotations__:
             raise TypeError(f"{name}: expected no argument of this name")
-        if name != "texture" and value is not None and not isinstance(value, Surfels if name == "surfels" else Model):
-            kind = "Surfels" if name == "surfels" else "Model"
-            raise TypeError(f"{name}: expected a nexwarp.{kind} or None, got {type(value).__name__}")
     surfels, init, texture = start.get("surfels"), start.get("init"), start.get("texture")
+    check_type("surfels", surfels, Surfels, optional=True)
+    check_type("init", init, Model, optional=True)
     if surfels is not None and init is not None:
         raise ValueError("init: expected None with surfels, which are the model's otherwise")
     if init is not None:

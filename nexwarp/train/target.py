@@ -18,6 +18,7 @@ import torch
 from nexwarp.cameras.camera import Camera, visible_points
 from nexwarp.cameras.paths import between
 from nexwarp.data import Scene, View
+from nexwarp.errors import check_type
 from nexwarp.machine import derived_seed, in_threads
 from nexwarp.model.exposures import DECIMALS
 from nexwarp.model.graphs import MOST_GRAPHS, share_graphs, without_graphs
@@ -268,8 +269,7 @@ def check_teachers(teachers: Iterable[Model], scene: Scene, config: Config) -> l
     if models and config.refine_poses:
         raise ValueError("teachers: expected refine_poses=False, for poses that stay as given")
     for number, model in enumerate(models):
-        if not isinstance(model, Model):
-            raise TypeError(f"teachers[{number}]: expected a nexwarp.Model, got {type(model).__name__}")
+        check_type(f"teachers[{number}]", model, Model)
         check_scale(f"teachers[{number}]", model, scene)
     return models
 
