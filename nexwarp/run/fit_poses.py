@@ -13,7 +13,7 @@ from nexwarp.cameras.camera import Camera
 from nexwarp.data import View
 from nexwarp.errors import check_range
 from nexwarp.model.model import Model
-from nexwarp.model.poses import corrected, pose_differences
+from nexwarp.model.poses import PoseCorrections, pose_differences
 
 STEPS = 80  # of each view; the first half sees the photo at half its size
 RATE = 5e-3  # Adam's first learning rate: radians, and shifts in scene scales
@@ -61,21 +61,18 @@ def _fit(model: Model, view: View, unit: float, steps: int) -> Camera:
     photo = view.image.to(model.device).float() / 255
     whole = (start, photo, torch.ones_like(photo[..., 0]) if view.mask is None else view.mask.to(photo))
     half = _halved(*whole) if min(start.width, start.height) > 1 else whole
-    twist = torch.zeros(6, device=model.device, requires_grad=True)
-    units = torch.tensor([1.0] * 3 + [unit] * 3, device=model.device)
-    optimizer = torch.optim.Adam([twist], lr=RATE)
+    poses = PoseCorrections([start], unit, [_middle_depth(model, start, unit)]).to(model.device)
+    optimizer = torch.optim.Adam(poses.parameters(), lr=RATE)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, LAST_RATE ** (1 / steps))
-    pivot = _middle_depth(model, start, unit)
     best = start
     least = float("inf")
     for step in range(steps + 1):
         aim = half if 0 < step < steps // 2 else whole  # the given pose is judged at full size
         camera, target, counts = aim
-        moved = _at(camera, corrected(start.viewmat, units * twist, pivot))
-        errors = (model.render(moved).image.clamp(0, 1) - target).abs().mean(-1)
+        errors = (model.render(poses.camera(camera, 0)).image.clamp(0, 1) - target).abs().mean(-1)
         error = (errors * counts).sum() / counts.sum().clamp(min=1)
         if aim is whole and error.item() < least:
-            best = _at(start, moved.viewmat.detach())
+            (best,) = poses.cameras([start])
             least = error.item()
         optimizer.zero_grad()
         error.backward()
@@ -84,17 +81,12 @@ def _fit(model: Model, view: View, unit: float, steps: int) -> Camera:
     return best.to("cpu")
 
 
-def _at(camera: Camera, viewmat: torch.Tensor) -> Camera:
-    """Return a camera at another pose; its numbers need no check, which would wait for the device."""
-    return dataclasses.replace(camera, viewmat=viewmat, checked=(camera.fx, camera.fy, camera.cx, camera.cy))
-
-
 @torch.no_grad()
-def _middle_depth(model: Model, camera: Camera, unit: float) -> torch.Tensor:
-    """Return the median z-depth of a rendering, (), world units; where nothing is hit, `unit`."""
+def _middle_depth(model: Model, camera: Camera, unit: float) -> float:
+    """Return the median z-depth of a rendering, world units; where nothing is hit, `unit`."""
     depths = model.render(camera).median_depth
     hit = depths[depths > 0]
-    return hit.median() if len(hit) else depths.new_tensor(unit)
+    return hit.median().item() if len(hit) else unit
 
 
 def _halved(camera: Camera, photo: torch.Tensor, counts: torch.Tensor) -> Aim:
