@@ -69,12 +69,6 @@ def load_channels(rows: vec4_rows, i: int):
 
 
 @func_per_real
-def blend_channels(surfels: Surfels, i: int, weight: real, total: mat44):
-    """Add weight times the channels of surfel i; i = -1 has the weight 0."""
-    return total + load_channels(surfels.channels, wp.max(i, 0)) * weight
-
-
-@func_per_real
 def store_channels(hits: Hits, p: int, total: mat44):
     """Write the channels of pixel p."""
     if wp.static(wide):
@@ -154,7 +148,7 @@ def collect(first: int, surfels: Surfels, lists: TileLists, view: View, hits: Hi
                         c = record_row(surfels.records, wp.max(i, 0), 3)
                 color += vec3(c[0], c[1], c[2]) * weight
                 if wp.static(wide):
-                    more = blend_channels(surfels, i, weight, more)
+                    more += load_channels(surfels.channels, wp.max(i, 0)) * weight
     if not inside:
         return
     p = xy[1] * view.size[0] + xy[0]

@@ -15,11 +15,10 @@ from typing import Any
 
 import warp as wp
 
-from nexwarp.kernels.types import per_real
+from nexwarp.kernels.types import func_per_real, per_real
 from nexwarp.native.warp import lane_index, warp_size, warp_sum
 
 WEIGHT_EPSILON = 1e-6  # keeps the un-premultiplied texture finite where nothing is textured
-EPS = wp.constant(wp.float64(WEIGHT_EPSILON))
 
 
 @wp.func
@@ -189,12 +188,12 @@ def place_of(places: wp.array(dtype=wp.int64), i: int):
     return i
 
 
-@wp.func
-def mean_depth(depths: wp.array2d(dtype=Any), weights: wp.array2d(dtype=Any), p: int):
-    mean = depths.dtype(0.0)
+@func_per_real
+def mean_depth(depths: real_rows, weights: real_rows, p: int):
+    mean = real(0.0)
     for h in range(depths.shape[1]):
         mean += weights[p, h] * depths[p, h]
-    return mean / (total(weights, p) + weights.dtype(EPS))
+    return mean / (total(weights, p) + WEIGHT_EPSILON)
 
 
 @per_real()
