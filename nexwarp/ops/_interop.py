@@ -1,9 +1,7 @@
 """The torch <-> Warp boundary: arrays, types, devices and streams."""
 
-import ctypes
 import functools
 import os
-import sys
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
@@ -182,13 +180,12 @@ def _struct(kind: WarpObject, given: dict[str, Argument]) -> Argument:
 # Warp prints a banner when it starts, and a line for each module that it loads: users of nexwarp do not know these.
 if wp.config.log_level == wp.LOG_INFO:
     wp.config.log_level = wp.LOG_WARNING
-DRIVERS = ("nvcuda.dll",) if sys.platform == "win32" else ("libcuda.so", "libcuda.so.1")
 
 
-@functools.cache  # looking for the driver takes as long as a launch
+@functools.cache
 def start_warp() -> None:
-    """Initialise Warp; without the NVIDIA driver, its warning of that, which Python does not see, is not printed."""
-    if any(_can_load(name) for name in DRIVERS):
+    """Initialise Warp; without a GPU, its warning of a missing driver, which Python does not see, is not printed."""
+    if torch.cuda.is_available():
         wp.init()
         return
     try:
@@ -203,14 +200,6 @@ def start_warp() -> None:
     finally:
         os.dup2(stderr, 2)
         os.close(stderr)
-
-
-def _can_load(library: str) -> bool:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True
 
 
 @functools.lru_cache(maxsize=64)
