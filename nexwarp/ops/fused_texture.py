@@ -3,7 +3,6 @@
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -62,14 +61,6 @@ def usable(points: Points, field: Field, rays: Rays) -> bool:
     )
 
 
-class Kept(NamedTuple):
-    """What the backward pass needs of the forward pass."""
-
-    encoded: torch.Tensor  # the features as fragments, 64 bytes a point; empty if there will be no backward pass
-    packed: torch.Tensor  # the matrices in half precision, in the order in which the kernels' lanes load them
-    colors: torch.Tensor  # (n, 3) the result if it was clamped, else empty
-
-
 def colors(points: Points, field: Field, rays: Rays, *, keep: bool) -> torch.Tensor:
     """Return colours (n, 3), differentiable with respect to positions, depths, grid and weights.
 
@@ -84,25 +75,27 @@ class _Colors(torch.autograd.Function):
     def forward(
         ctx: Context, points: Points, field: Field, rays: Rays, keep: bool, *tensors: torch.Tensor
     ) -> torch.Tensor:
-        result, kept = forward(points, field, rays, keep)
+        result, encoded, packed = forward(points, field, rays, keep)
         if keep:
             ctx.rest = replace(rays, directions=rays.directions[:0])
             fixed = (rays.directions, points.focal, field.stored(), field.resolutions)
-            ctx.save_for_backward(points.positions, points.depths, *fixed, *kept, *field.weights)
+            clamped = result if rays.clamp else result.new_empty(0, 3)
+            ctx.save_for_backward(points.positions, points.depths, *fixed, encoded, packed, clamped, *field.weights)
         return result
 
     @staticmethod
     @first_derivative
     def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-        positions, depths, directions, focal, table, resolutions, encoded, packed, result, *weights = ctx.saved_tensors
+        positions, depths, directions, focal, table, resolutions, encoded, packed, clamped, *weights = ctx.saved_tensors
         need_positions, need_depths, need_grid = ctx.needs_input_grad[4:7]
         points, field = Points(positions, depths, focal), Field(table, weights, resolutions, True, table)
-        kept, grad = Kept(encoded, packed, result), grad.contiguous()
+        grad = grad.contiguous()
         scale, unscale = gradient_scales(grad, table.dtype)
         grad_encoded = torch.empty_like(encoded) if graph_is_kept() else encoded  # else gradients overwrite features
-        fused, units = _fused(points, field, replace(ctx.rest, directions=directions), kept)
-        fused |= {"scale": scale, "unscale": unscale, "grad_colors": grad, "grad_encoded": grad_encoded}
-        grad_matrices = _mlp_backward(fused, weights, table, unscale)
+        fused, units = _fused(points, field, replace(ctx.rest, directions=directions), packed)
+        fused |= {"encoded": encoded, "scale": scale, "unscale": unscale}
+        fused |= {"grad_colors": grad, "grad_encoded": grad_encoded}
+        grad_matrices = _mlp_backward(fused, weights, table, clamped, unscale)
         grad_grid, grad_points = _scatter(fused, points, table, units, need_positions or need_depths)
         return (
             *(None,) * 4,
@@ -113,7 +106,7 @@ class _Colors(torch.autograd.Function):
         )
 
 
-def _fused(points: Points, field: Field, rays: Rays, kept: Kept) -> tuple[dict[str, Argument], int]:
+def _fused(points: Points, field: Field, rays: Rays, packed: torch.Tensor) -> tuple[dict[str, Argument], int]:
     """The fields of `kernels.fused_texture.Fused` that all kernels read, and the number of tiles times hits."""
     height, width = rays.image or (1, len(rays.directions))
     hits, shift = len(points) // max(len(rays.directions), 1), 3 if height > 1 else 4
@@ -122,26 +115,30 @@ def _fused(points: Points, field: Field, rays: Rays, kept: Kept) -> tuple[dict[s
     image = {"width": width, "height": height, "hits": hits, "shift": shift}
     seen = {"positions": points.positions, "depths": points.depths, "directions": rays.directions}
     texture = {"table": table, "mask": table.shape[1] - 1, "resolutions": field.resolutions, "focal": points.focal}
-    results = {"offset": rays.offset, "clamp": int(rays.clamp), "encoded": kept.encoded, "colors": kept.colors}
-    return {**image, **seen, **texture, "packed": kept.packed, **results}, units
+    return {**image, **seen, **texture, "packed": packed, "offset": rays.offset, "clamp": int(rays.clamp)}, units
 
 
-def forward(points: Points, field: Field, rays: Rays, keep: bool) -> tuple[torch.Tensor, Kept]:
-    """Return the colours (n, 3), and what the backward pass needs, without the features unless `keep`."""
+def forward(points: Points, field: Field, rays: Rays, keep: bool) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the colours (n, 3), the features as fragments, 64 bytes a point or none unless `keep`, and the matrices.
+
+    These are in half precision, in the order in which the kernels' lanes load them.
+    """
     packed, result = _pack(field.weights, field.grid.shape[2]), torch.empty_like(points.positions)
-    kept = Kept(packed.new_empty(0), packed, result)
-    fused, units = _fused(points, field, rays, kept)
-    if keep:
-        kept = kept._replace(encoded=packed.new_empty(units * 256))
-        fused["encoded"] = kept.encoded
+    fused, units = _fused(points, field, rays, packed)
+    encoded = packed.new_empty(units * 256 if keep else 0)
+    fused |= {"encoded": encoded, "colors": result}
     threads = FORWARD_THREADS * FORWARD_BLOCKS * _multiprocessors(result)
     kernel = fused_kernels(field.grid.shape[2]).forward
     launch(result, kernel, threads, [threads, fused], [], block_dim=FORWARD_THREADS)
-    return result, kept if rays.clamp else kept._replace(colors=result.new_empty(0, 3))
+    return result, encoded, packed
 
 
 def _mlp_backward(
-    fused: dict[str, Argument], weights: Sequence[torch.Tensor], table: torch.Tensor, unscale: torch.Tensor
+    fused: dict[str, Argument],
+    weights: Sequence[torch.Tensor],
+    table: torch.Tensor,
+    clamped: torch.Tensor,
+    unscale: torch.Tensor,
 ) -> list[torch.Tensor]:
     """Write the gradients of the features, scaled, and return those of the matrices."""
     features, blocks = table.shape[2], BACKWARD_BLOCKS * _multiprocessors(table)
@@ -149,7 +146,7 @@ def _mlp_backward(
     arguments = {**fused, "grad_matrices": slots}
     threads = BACKWARD_THREADS * blocks
     kernel = fused_kernels(features).backward
-    launch(table, kernel, threads, [threads, arguments, fused["colors"]], [], block_dim=BACKWARD_THREADS)
+    launch(table, kernel, threads, [threads, arguments, clamped], [], block_dim=BACKWARD_THREADS)
     order = _order(features, len(weights[-1]), table.device)
     gradients = slots.sum(0).index_select(0, order) * unscale
     parts = gradients.split([matrix.numel() for matrix in weights])
