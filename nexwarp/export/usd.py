@@ -146,14 +146,11 @@ def _particles(stage: "Usd.Stage", surfels: Surfels, sh_degree: int, exposure: f
     """Define the particle field of the surfels, dimmed as the cards are."""
     from pxr import UsdGeom, UsdVol, Vt
 
-    found = gaussians(surfels, sh_degree, (), float("inf"))  # surflets are exact at any size
-    means, quats, scales, sh = (
-        x.float().cpu().numpy()
-        for x in (found.means, found.quats.roll(-1, 1), found.log_scales.exp(), found.sh[:, : (sh_degree + 1) ** 2])
-    )
+    splats = gaussians(surfels, sh_degree, (), float("inf"))  # surflets are exact at any size
+    shape = (splats.means, splats.quats.roll(-1, 1), splats.log_scales.exp(), splats.logit_opacities.sigmoid())
+    means, quats, scales, opacities, sh = (x.float().cpu().numpy() for x in (*shape, splats.sh))
     sh = sh * exposure
     sh[:, 0] += (exposure - 1) * 0.5 / BAND_0
-    opacities = found.logit_opacities.sigmoid().float().cpu().numpy()
     field = UsdVol.ParticleField.Define(stage, f"{ROOT}/Surfels")
     prim = field.GetPrim()
     UsdVol.ParticleFieldKernelGaussianSurfletAPI.Apply(prim)

@@ -72,16 +72,14 @@ def authority(text: str) -> tuple[str, int] | None:
 
 @dataclass(frozen=True)
 class Access:
-    """Rules on the requests of a server: `local` on a loopback address; else each must hold the token."""
+    """Rules on the requests of a server: each must hold the token; on a loopback address there is none."""
 
-    local: bool
-    token: str
+    token: str = ""
 
     @staticmethod
     def to(address: str) -> "Access":
         """Return the rules for a server that listens on this numeric address, with a random token if it needs one."""
-        local = is_loopback(address)
-        return Access(local, "" if local else secrets.token_urlsafe(TOKEN_BYTES))
+        return Access("" if is_loopback(address) else secrets.token_urlsafe(TOKEN_BYTES))
 
     def refusal(self, target: str, headers: Headers) -> str | None:
         """Return why a request for `target`, such as "/?token=...", is refused, for its sender; None if it may pass."""
@@ -89,7 +87,7 @@ class Access:
         host = authority(hosts[0]) if len(hosts) == 1 else None
         if host is None:
             return "the request needs one header Host: expected the address of the viewer"
-        if self.local and host[0] != "localhost" and not is_loopback(host[0]):
+        if not self.token and host[0] != "localhost" and not is_loopback(host[0]):
             return "the viewer serves this machine only: expected http://localhost or http://127.0.0.1 in the address"
         for origin in origins:
             scheme, _, own = origin.partition("://")

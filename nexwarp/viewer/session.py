@@ -369,10 +369,10 @@ class Session:
         self.frustum_size = frustum_size(self.places)
         self.shown = np.ones(len(chosen), dtype=bool)
         self.group = self.client.scene.add_frame("/cameras", show_axes=False)
-        self.frustums: dict[str, viser.CameraFrustumHandle] = {}
+        self.frustums: list[viser.CameraFrustumHandle] = []
         for name, pose, place in zip(chosen, poses, self.places, strict=True):
             camera = self.cameras[name]
-            self.frustums[name] = self.client.scene.add_camera_frustum(
+            frustum = self.client.scene.add_camera_frustum(
                 f"/cameras/{name}",
                 fov=vertical_fov(camera),
                 aspect=camera.width / camera.height * camera.fy / camera.fx,
@@ -385,7 +385,8 @@ class Session:
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            self.frustums[name].on_click(partial(self._clicked, name))
+            frustum.on_click(partial(self._clicked, name))
+            self.frustums.append(frustum)
 
     async def _clicked(self, name: str, _: object) -> None:
         if self.measure is None or not self.measure.active.value:
@@ -396,9 +397,8 @@ class Session:
         assert self.viewpoint is not None
         eye = self.world.to_browser(self.viewpoint.pose[:3, 3])
         far = np.linalg.norm(self.places - eye, axis=1) > 1.5 * self.frustum_size
-        frustums = list(self.frustums.values())
         for i in np.flatnonzero(far != self.shown):
-            frustums[i].visible = bool(far[i])
+            self.frustums[i].visible = bool(far[i])
         self.shown = far
 
     # The controls

@@ -8,8 +8,7 @@ from nexwarp.viewer import Viewer, listen
 from nexwarp.viewer.security import Access, is_loopback
 from tests.viewer.support import Client, serving
 
-LOCAL = Access(local=True, token="")
-OPEN = Access(local=False, token="secret")
+LOCAL, OPEN = Access(), Access(token="secret")
 
 
 def headers(host: str, origin: str | None = None, **others: str) -> Headers:
