@@ -242,10 +242,10 @@ def in_image(pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int
 
 def visible_points(
     pixels: torch.Tensor, depths: torch.Tensor, width: int, height: int, mask: torch.Tensor | None = None
-) -> tuple[torch.Tensor, torch.Tensor] | None:
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Select the points that project into an image, and where there is a mask (H, W), to True.
 
-    Return the row-major indices (P,) of their pixels, and their z-depths (P,); None if there are no such points.
+    Return the row-major indices (P,) of their pixels, and their z-depths (P,).
     """
     inside = in_image(pixels, depths, width, height)
     column, row = pixels[inside].long().unbind(-1)
@@ -253,7 +253,7 @@ def visible_points(
     if mask is not None:
         included = mask.flatten()[places]
         places, expected = places[included], expected[included]
-    return (places, expected) if len(places) else None
+    return places, expected
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:

@@ -88,10 +88,7 @@ def _samples(view: View, cloud: Cloud | None) -> Samples:
         points = torch.from_numpy(cloud.positions[:: -(-len(cloud.positions) // MOST_POINTS)]).float()
     if points is None or view.depth is None:
         return none, none
-    seen = visible_points(*camera.project(points), camera.width, camera.height, view.mask)
-    if seen is None:
-        return none, none
-    places, depths = seen
+    places, depths = visible_points(*camera.project(points), camera.width, camera.height, view.mask)
     values = view.depth.flatten()[places]
     return values[values > 0].double().numpy(), depths[values > 0].double().numpy()
 

@@ -199,9 +199,8 @@ def check_origin(origin: Mapping[str, str], config: Config, state: Mapping[str, 
         raise ValueError("it went on at lowered rates after a divergence, which this version does not support")
     # Neither CUDA graphs nor how many teachers the run would train first changes what a trainer does.
     saved = config_from_dict(state["config"])
-    saved = dataclasses.replace(saved, cuda_graphs=config.cuda_graphs, teachers=config.teachers)
-    if extend and saved.iterations < config.iterations:
-        saved = dataclasses.replace(saved, iterations=config.iterations)
+    iterations = max(saved.iterations, config.iterations) if extend else saved.iterations
+    saved = dataclasses.replace(saved, iterations=iterations, cuda_graphs=config.cuda_graphs, teachers=config.teachers)
     if saved != config:
         raise ValueError("its settings are others")
     if state["views"] != origin["views"]:

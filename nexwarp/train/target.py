@@ -152,9 +152,7 @@ class TargetSource:
             with torch.no_grad():
                 moved = camera if self.poses is None else self.poses.camera(camera, index)
                 seen = moved.project(points.to(device))
-            visible = visible_points(*seen, camera.width, camera.height, self.views.mask(index))
-            none = torch.zeros(0, dtype=torch.int64, device=device), torch.zeros(0, device=device)
-            places, expected = none if visible is None else visible
+            places, expected = visible_points(*seen, camera.width, camera.height, self.views.mask(index))
             places, order = places.sort(stable=True)
             # On CUDA, as many for every view, so that one graph serves all of them. Steps that are not captured pad
             # too: sums of other lengths are rounded differently.

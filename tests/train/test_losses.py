@@ -103,14 +103,14 @@ def test_visible_points_by_hand() -> None:
     nan = float("nan")
     pixels = torch.tensor([[2.9, 1.1], [4.0, 1.0], [2.5, -0.1], [nan, 1.0], [2.5, 1.5], [0.0, 2.999], [1.0, 3.0]])
     depths = torch.tensor([2.0, 2.0, 2.0, 1.0, -2.0, 5.0, 1.0])
-    places, expected = present(visible_points(pixels, depths, 4, 3))
+    places, expected = visible_points(pixels, depths, 4, 3)
     assert places.tolist() == [1 * 4 + 2, 2 * 4 + 0] and expected.tolist() == [2.0, 5.0]
     mask = torch.ones(3, 4, dtype=torch.bool)
     mask[1, 2] = False
-    places, expected = present(visible_points(pixels, depths, 4, 3, mask))
+    places, expected = visible_points(pixels, depths, 4, 3, mask)
     assert places.tolist() == [8] and expected.tolist() == [5.0]
-    assert visible_points(pixels, depths, 4, 3, torch.zeros(3, 4, dtype=torch.bool)) is None
-    assert visible_points(pixels, -depths.abs(), 4, 3) is None
+    assert not visible_points(pixels, depths, 4, 3, torch.zeros(3, 4, dtype=torch.bool))[0].numel()
+    assert not visible_points(pixels, -depths.abs(), 4, 3)[0].numel()
 
 
 def test_depth_loss_by_hand(device: torch.device) -> None:
