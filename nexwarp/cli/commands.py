@@ -206,11 +206,8 @@ class Render:
 
     def __call__(self, console: Console) -> None:
         """Render."""
-        device = pick_device(self.device)
-        self.pictures.check()
-        opened = open_model(self.run)
-        model = opened.model.to(device)
-        job = self.pictures.prepare(opened)
+        device, opened = pick_device(self.device), open_model(self.run)
+        job, model = self.pictures.prepare(opened), opened.model.to(device)
         if self.pictures.path is None and job.path is not None:
             surround = "surround" if job.path == "ellipse" else "do not surround"
             console.print(f"--path {job.path}, as the cameras {surround} what they look at")
@@ -239,9 +236,7 @@ class Export:
 
     def __call__(self, console: Console) -> None:
         """Export."""
-        self.files.check()
-        opened = open_model(self.run)
-        device, lines = pick_device(self.device), list[str]()
+        device, opened, lines = pick_device(self.device), open_model(self.run), list[str]()
         if self.files.format in RENDERED:
             with display.stages(console) as observe:
                 files = export_run(opened, self.files, device, observe, lines.append)

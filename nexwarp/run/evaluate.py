@@ -204,9 +204,6 @@ def _unit_images(
     image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Check two images and return them as float32 multiples of 1/255; excluded pixels take the target's values."""
-    for name, tensor in (("image", image), ("target", target)):
-        if not isinstance(tensor, torch.Tensor):
-            raise TypeError(f"{name}: expected a torch.Tensor, got {type(tensor).__name__}")
     if image.ndim != 3 or image.shape[-1] != 3:
         raise ValueError(f"image: expected shape (H, W, 3), got {tuple(image.shape)}")
     if target.shape != image.shape:
