@@ -250,5 +250,4 @@ def check_points(source: Path, positions: np.ndarray, what: str, name: Callable[
 
 def short(value: object) -> str:
     """The representation of a value in at most 60 characters, for messages."""
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    return one_line(repr(value), 60)

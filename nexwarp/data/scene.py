@@ -179,7 +179,7 @@ class Scene:
     reprojection_errors: torch.Tensor
     scale: float
     path: Path
-    background: Color | None = None
+    background: tuple[float, float, float] | None = None
     random_background: bool = False
     white: float | None = None
     origin: torch.Tensor = field(default_factory=partial(torch.zeros, 3, dtype=torch.float64))
