@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from nexwarp.data.images import downscale_image
-from nexwarp.errors import SceneError, SettingError
+from nexwarp.errors import SceneError
 from nexwarp.io.pictures import save_jpeg
-from nexwarp.io.video import check_av, frame_luma, frame_pixels, read_frames
+from nexwarp.io.video import frame_luma, frame_pixels, read_frames
 
 SIDE = 640  # pixels of the longer side at which sharpness is measured: a blur below two of its pixels hardly shows
 THUMBNAIL = 160  # pixels of the longer side at which motion is measured
@@ -74,13 +74,6 @@ def motion(luma: np.ndarray, before: np.ndarray) -> float:
     first, second = before.astype(np.float32), luma.astype(np.float32)
     gradient = float(np.mean(np.hypot(*np.gradient(first))))
     return float(np.mean(np.abs(second - first))) / max(gradient, FLAT)
-
-
-def check_frames(path: str | os.PathLike[str], count: int) -> None:
-    """Raise SettingError if a video cannot be divided into `count` parts, or PyAV is missing."""
-    if count < FEWEST:
-        raise SettingError(f"--frames: expected at least {FEWEST}, got {count}")
-    check_av(path)
 
 
 def take_frames(

@@ -20,12 +20,13 @@ from pathlib import Path
 from signal import Signals
 from subprocess import PIPE
 
-from nexwarp.data.sfm.frames import check_frames, take_frames
+from nexwarp.data.sfm.frames import FEWEST, take_frames
 from nexwarp.data.sfm.photos import SECOND, list_photos
 from nexwarp.data.sfm.report import PYCOLMAP, Observer, SfmOptions, SfmReport
-from nexwarp.errors import OutOfMemoryError, SceneError, StorageError
+from nexwarp.errors import OutOfMemoryError, SceneError, StorageError, require
 from nexwarp.io.files import made_folders, one_line
 from nexwarp.io.json_files import Json, write_json
+from nexwarp.io.video import check_av
 from nexwarp.machine import needed_memory
 
 REPORT_FILE = "sfm.json"
@@ -87,7 +88,8 @@ def process(
     if options.strict and (name := next((name for name in skipped if skipped[name] != SECOND), None)):
         raise SceneError(f"{source / name}: {skipped[name]}")
     if video:
-        check_frames(source, frames)
+        require(frames >= FEWEST, f"--frames: expected at least {FEWEST}, got {frames}")
+        check_av(source)
     _check_target(source, scene)
     with _folder_beside(scene) as folder:
         order = Order(source.absolute(), names, skipped, folder, frames, options, source_identity(source))
