@@ -44,15 +44,15 @@ def save_transforms(
     path: str | os.PathLike[str],
     cameras: Mapping[str, Camera],
     *,
-    train: Sequence[str] = (),
-    test: Sequence[str] = (),
+    train: Sequence[str] | None = None,
+    test: Sequence[str] | None = None,
     lenses: Mapping[str, Mapping[str, Json]] | None = None,
 ) -> None:
     """Write cameras, by the names of their image files, as a `transforms.json`, atomically.
 
     Each frame has its own intrinsics, so that sizes may differ. `lenses` has for some names the keys of a distorted
     lens, with its `camera_model`, in place of the camera's intrinsics. `train` are the names for `train_filenames`,
-    `test` those for `val_filenames` and `test_filenames`. ValueError: no cameras.
+    `test` those for `val_filenames` and `test_filenames`; if both are None, no split is written. ValueError: none.
     """
     if not cameras:
         raise ValueError("cameras: expected at least one, got none")
@@ -64,8 +64,10 @@ def save_transforms(
     models = [frame.pop("camera_model") for frame in frames]  # nerfstudio reads one for the file
     for frame, model in zip(frames, models, strict=True):
         frame |= {} if model == models[0] else {"camera_model": model}
-    split = {"train_filenames": list(train), "val_filenames": list(test), "test_filenames": list(test)}
-    data = {"camera_model": models[0], "frames": frames, **split}
+    data: dict[str, object] = {"camera_model": models[0], "frames": frames}
+    if train is not None or test is not None:
+        held_out = list(test or [])
+        data |= {"train_filenames": list(train or []), "val_filenames": held_out, "test_filenames": held_out}
     write_atomically(Path(path), (json.dumps(data, indent=2) + "\n").encode())
 
 

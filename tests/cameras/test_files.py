@@ -43,6 +43,8 @@ def test_transforms_come_back(tmp_path: Path) -> None:
         assert [frame[key] for key in ("fl_x", "fl_y", "cx", "cy")] == [camera.fx, camera.fy, camera.cx, camera.cy]
         assert (frame["w"], frame["h"]) == (camera.width, camera.height)
     assert data["train_filenames"] == names[1:] and data["val_filenames"] == data["test_filenames"] == names[:1]
+    save_transforms(tmp_path / "all.json", before)  # without a split: a reader's own holds
+    assert json.loads((tmp_path / "all.json").read_text()).keys() == {"camera_model", "frames"}
 
 
 @pytest.mark.parametrize("centred", [True, False])
