@@ -14,23 +14,14 @@ from nexwarp.export.glb import CUTOFF, bake_cards, make_cards, save_glb
 from nexwarp.export.splats import gaussians, save_splats_spz
 from nexwarp.export.web.baked import encode_atlas, encode_baked, encode_harmonics
 from tests.export.web import support
-from tests.export.web.support import as_stored, psnr, ring
+from tests.export.web.support import as_stored, psnr, ring, small_model
 from tests.narrowing import present
-from tests.scenes import make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
-
-
-def make_model(residual: bool = True, count: int = 12, sh_degree: int = 1) -> nw.Model:
-    scene = random_scene(count, width=64, height=48, seed=3, sh_degree=sh_degree)
-    texture = make_texture(residual=residual, sh_degree=sh_degree)
-    with torch.no_grad():
-        texture.grid.mul_(0.3)
-    return nw.Model(make_surfels(scene), texture, options=nw.RenderOptions(background=(0.1, 0.2, 0.3)))
 
 
 @pytest.fixture(scope="module")
 def model() -> nw.Model:
-    return make_model()
+    return small_model(sh_degree=1)
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +62,7 @@ def test_an_atlas_that_is_too_small_has_larger_texels(model, cameras, monkeypatc
 @pytest.mark.parametrize("residual", [True, False])
 def test_the_first_atlas_has_the_colors_of_the_texture(residual, cameras):
     """A texture without dependence on the direction, on a surfel that is textured in all views, is baked exactly."""
-    model = make_model(residual, count=1, sh_degree=0)
+    model = small_model(1, residual=residual, sh_degree=0)
     seen = observe(model, list(cameras.values()))
     assert seen.textured[0] == 1
     image = evaluate(model, seen, lay_out(seen.boxes, 4 * seen.pixels)).render(cameras["1.png"])

@@ -2,7 +2,6 @@ import dataclasses
 import math
 import re
 import struct
-from pathlib import Path
 
 import pytest
 import torch
@@ -42,15 +41,10 @@ def baked(model, cameras):
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("page")
-
-
-@pytest.fixture(scope="module")
-def files(model, cameras, folder) -> dict[str, bytes]:
+def files(model, cameras, tmp_path_factory) -> dict[str, bytes]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("nexwarp.export.fit.FEWEST_STEPS", 10)
-        return support.exported(model, cameras, folder)
+        return support.exported(model, cameras, tmp_path_factory.mktemp("page"))
 
 
 def in_double(scene: BakedScene) -> BakedScene:
@@ -140,10 +134,11 @@ def test_images_and_gradients_are_those_of_the_definition(form, device):
     assert form == "mask" or len(expected) == (5 if form == "surfels" else 2)
 
 
-def test_a_page_is_read_as_it_is_drawn(files, folder, model, baked, cameras, tmp_path):
-    (tmp_path / "one.html").write_bytes(one_file(files))
-    places = (tmp_path / "one.html", folder, folder / "index.html", folder / BAKED_FILE)
-    scenes = [nw.load_baked(place) for place in places]
+def test_a_page_is_read_as_it_is_drawn(files, model, baked, cameras, tmp_path):
+    for name, content in {"one.html": one_file(files), **files}.items():
+        if "/" not in name:
+            (tmp_path / name).write_bytes(content)
+    scenes = [nw.load_baked(tmp_path / place) for place in ("one.html", "", "index.html", BAKED_FILE)]
     for camera in cameras.values():
         images = [scene.render(camera) for scene in scenes]
         assert all(torch.equal(image, images[0]) for image in images)

@@ -14,8 +14,7 @@ from nexwarp.export.mesh import Mesh
 from nexwarp.export.usd import save_usdz
 from nexwarp.io.pictures import to_uint8
 from nexwarp.kernels.sh import BAND_0
-from tests.export.test_bake import make_model
-from tests.export.web.support import ring
+from tests.export.web.support import ring, small_model
 from tests.tolerances import assert_close
 
 pytest.importorskip("pxr", reason="usd-core (extra `usd`)")
@@ -24,7 +23,7 @@ pytest.importorskip("pxr", reason="usd-core (extra `usd`)")
 @pytest.fixture
 def made():
     """A model, cameras around it, and its cards."""
-    model, views = make_model(), list(ring().values())
+    model, views = small_model(sh_degree=1), list(ring().values())
     return model, views, bake_cards(model, views, steps=1)
 
 

@@ -140,15 +140,22 @@ def ring(count: int = 4, width: int = 64, height: int = 48) -> dict[str, nw.Came
     return cameras
 
 
-def ring_model(cameras: dict[str, nw.Camera], count: int, limits: nw.DetailLimits | None = None) -> nw.Model:
-    """A small model of the random scene, with a residual texture, and exposures and vignetting of the cameras."""
-    gains = torch.linspace(-0.3, 0.3, len(cameras))[:, None].expand(-1, 3) * torch.tensor([1.0, 0.5, -0.5])
-    exposures = nw.Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
-    texture = make_texture(residual=True)
+def small_model(count: int = 12, *, residual: bool = True, sh_degree: int = 3) -> nw.Model:
+    """The random scene with a texture."""
+    texture = make_texture(residual=residual, sh_degree=sh_degree)
     with torch.no_grad():
         texture.grid.mul_(0.3)
-    surfels = make_surfels(random_scene(count, width=64, height=48, seed=3))
-    return nw.Model(surfels, texture, exposures, limits, nw.RenderOptions(background=(0.1, 0.2, 0.3)))
+    surfels = make_surfels(random_scene(count, width=64, height=48, seed=3, sh_degree=sh_degree))
+    return nw.Model(surfels, texture, options=nw.RenderOptions(background=(0.1, 0.2, 0.3)))
+
+
+def ring_model(cameras: dict[str, nw.Camera], count: int, limits: nw.DetailLimits | None = None) -> nw.Model:
+    """A small model with exposures and vignetting of the cameras."""
+    gains = torch.linspace(-0.3, 0.3, len(cameras))[:, None].expand(-1, 3) * torch.tensor([1.0, 0.5, -0.5])
+    model = small_model(count)
+    model.exposures = nw.Exposures.of(gains, list(cameras.values()), (-0.4, 0.1, 0.7))
+    model.detail_limits = limits
+    return model
 
 
 def exported(model: nw.Model, cameras: dict[str, nw.Camera], folder: Path, **options: Any) -> dict[str, bytes]:
