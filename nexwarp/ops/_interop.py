@@ -3,7 +3,7 @@
 import functools
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import torch
@@ -33,9 +33,6 @@ class Context(torch.autograd.function.FunctionCtx):
         """Keep tensors for the backward pass."""
 
 
-Backward = Callable[..., tuple[torch.Tensor | None, ...]]
-
-
 class _Gradients(torch.autograd.Function):
     """The first `count` tensors, gradients that depend on all others in a way that nothing here differentiates."""
 
@@ -48,30 +45,28 @@ class _Gradients(torch.autograd.Function):
         raise RuntimeError("second derivatives are not supported: nexwarp's kernels have first ones only")
 
 
-def first_derivative(backward: Backward) -> Backward:
-    """Decorate a backward pass so that differentiating its gradients raises.
+class Op(torch.autograd.Function):
+    """An op with a first derivative: differentiating the gradients that its backward pass returns raises.
 
     Torch's `once_differentiable` takes them for constants where the incoming ones are, or where `torch.autograd.grad`
     asks for the gradients of some tensors alone.
     """
 
-    @functools.wraps(backward)
-    def marked(ctx: Context, *signals: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
-        with torch.no_grad():
-            grads = backward(ctx, *signals)
-        if not torch.is_grad_enabled():
-            return grads
-        given = [x.detach().requires_grad_() for x in grads if x is not None]
-        sources = (x for x in (*ctx.saved_tensors, *signals) if x is not None and x.requires_grad)
-        marked_grads = iter(_Gradients.apply(len(given), *given, *sources) if given else ())
-        return tuple(None if x is None else next(marked_grads) for x in grads)
+    def __init_subclass__(cls) -> None:
+        backward = cls.backward
 
-    return marked
+        @functools.wraps(backward)
+        def marked(ctx: Context, *signals: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+            with torch.no_grad():
+                grads = backward(ctx, *signals)
+            if not torch.is_grad_enabled():
+                return grads
+            given = [x.detach().requires_grad_() for x in grads if x is not None]
+            sources = (x for x in (*ctx.saved_tensors, *signals) if x is not None and x.requires_grad)
+            marked_grads = iter(_Gradients.apply(len(given), *given, *sources) if given else ())
+            return tuple(None if x is None else next(marked_grads) for x in grads)
 
-
-def needed(grads: Sequence[torch.Tensor | None], needs: Sequence[bool]) -> tuple[torch.Tensor | None, ...]:
-    """Gradients, None for those that are not needed."""
-    return tuple(x if need else None for x, need in zip(grads, needs, strict=True))
+        cls.backward = staticmethod(marked)  # type: ignore[method-assign]
 
 
 def contiguous(*tensors: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:

@@ -4,7 +4,7 @@ import torch
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels import activate as kernels
-from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, needed
+from nexwarp.ops._interop import Context, Op, contiguous, launch
 
 
 def activate(
@@ -24,7 +24,7 @@ def activate(
     return _Activate.apply(*(x.contiguous() for x in raw))
 
 
-class _Activate(torch.autograd.Function):
+class _Activate(Op):
     @staticmethod
     def forward(ctx: Context, *raw: torch.Tensor) -> tuple[torch.Tensor, ...]:
         activated = tuple(torch.empty_like(x) for x in raw)
@@ -33,9 +33,8 @@ class _Activate(torch.autograd.Function):
         return activated
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         raw = ctx.saved_tensors
         grad_raw = tuple(torch.empty_like(x) for x in raw)
         launch(raw[0], kernels.activate_backward, len(raw[0]), [raw, contiguous(*grads)], [grad_raw])
-        return needed(grad_raw, ctx.needs_input_grad)
+        return grad_raw

@@ -8,7 +8,7 @@ from nexwarp.errors import check_tensors
 from nexwarp.kernels.atlas import blend, blend_backward, nearest
 from nexwarp.kernels.launch import Sharing
 from nexwarp.native.warp import tile_size_on
-from nexwarp.ops._interop import Argument, Context, first_derivative, launch
+from nexwarp.ops._interop import Argument, Context, Op, launch
 from nexwarp.ops.collect import Walked
 from nexwarp.ops.project import Pinhole, Projection
 from nexwarp.ops.tiles import Tiles
@@ -57,7 +57,7 @@ def draw_atlas(
     return _Draw.apply(projection.records, texels.contiguous(), boxes, rects.contiguous(), scene, cards, cut)
 
 
-class _Draw(torch.autograd.Function):
+class _Draw(Op):
     @staticmethod
     def forward(
         ctx: Context,
@@ -81,7 +81,6 @@ class _Draw(torch.autograd.Function):
         return image, alphas
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         scene, names, cut = ctx.rest
         texels, boxes, rects, ids, image, alphas = ctx.saved_tensors

@@ -17,8 +17,8 @@ from nexwarp.ops._interop import (
     Argument,
     Context,
     Kernel,
+    Op,
     contiguous,
-    first_derivative,
     from_fixed_point,
     launch,
     real_of,
@@ -176,7 +176,7 @@ class SlotSums:
         return sums
 
 
-class _Collect(torch.autograd.Function):
+class _Collect(Op):
     @staticmethod
     def forward(
         ctx: Context,
@@ -202,7 +202,6 @@ class _Collect(torch.autograd.Function):
         return outputs
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, *given: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         (scene, request), outputs = ctx.rest, ctx.saved_tensors
         # Zeros for what nothing depends on, unlike torch's own not for integers.

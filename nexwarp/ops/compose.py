@@ -3,7 +3,7 @@
 import torch
 
 from nexwarp.kernels import compose as kernels
-from nexwarp.ops._interop import Context, contiguous, first_derivative, launch
+from nexwarp.ops._interop import Context, Op, contiguous, launch
 
 
 def compose(
@@ -22,7 +22,7 @@ def compose(
     return _Compose.apply(*contiguous(plain, base, colors, weights, alpha, background))
 
 
-class _Compose(torch.autograd.Function):
+class _Compose(Op):
     @staticmethod
     def forward(ctx: Context, plain: torch.Tensor, *rest: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         _base, colors, weights, alpha, background = rest
@@ -33,7 +33,6 @@ class _Compose(torch.autograd.Function):
         return image, textured
 
     @staticmethod
-    @first_derivative
     def backward(
         ctx: Context, grad_image: torch.Tensor | None, grad_textured: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:

@@ -4,7 +4,7 @@ import torch
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels import detail as kernels
-from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, needed
+from nexwarp.ops._interop import Context, Op, contiguous, launch
 
 
 def antialias(
@@ -35,7 +35,7 @@ def antialias(
     return _Antialias.apply(farthest.contiguous(), focal, *tensors)
 
 
-class _Antialias(torch.autograd.Function):
+class _Antialias(Op):
     @staticmethod
     def forward(
         ctx: Context, farthest: torch.Tensor, focal: torch.Tensor, depths: torch.Tensor, *shape: torch.Tensor
@@ -47,13 +47,12 @@ class _Antialias(torch.autograd.Function):
         return blurred
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         farthest, focal, depths, *shape = ctx.saved_tensors
         grad_depths, *grad_shape = (torch.empty_like(x) for x in (depths, *shape))
         inputs = [depths, (None, *shape), farthest, focal, contiguous(None, *grads)]
         launch(farthest, kernels.antialias_backward, len(farthest), inputs, [grad_depths, (None, *grad_shape)])
-        return needed((None, None, grad_depths, *grad_shape), ctx.needs_input_grad)
+        return None, None, grad_depths, *grad_shape
 
 
 def limit_depths(
@@ -72,7 +71,7 @@ def limit_depths(
     return _LimitDepths.apply(ids, depths.contiguous(), nearest.contiguous(), farthest.contiguous(), focal)
 
 
-class _LimitDepths(torch.autograd.Function):
+class _LimitDepths(Op):
     @staticmethod
     def forward(ctx: Context, ids: torch.Tensor, depths: torch.Tensor, *limits: torch.Tensor) -> torch.Tensor:
         limited = torch.empty_like(depths)
@@ -81,7 +80,6 @@ class _LimitDepths(torch.autograd.Function):
         return limited
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         depths, limited = ctx.saved_tensors
         return None, grad.where(depths == limited, 0.0), None, None, None

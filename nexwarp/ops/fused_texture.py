@@ -26,7 +26,7 @@ from nexwarp.native.fused_texture import (
     logical_feature,
     logical_output,
 )
-from nexwarp.ops._interop import Argument, Context, first_derivative, graph_is_kept, launch
+from nexwarp.ops._interop import Argument, Context, Op, graph_is_kept, launch
 from nexwarp.ops.neural_field import Field, Points, Rays, gradient_scales
 
 GROUP_BYTES = 2**24  # of sums that a launch of the backward lookup adds to: a third of an H100's L2 cache
@@ -70,7 +70,7 @@ def colors(points: Points, field: Field, rays: Rays, *, keep: bool) -> torch.Ten
     return _Colors.apply(points, field, rays, keep, points.positions, points.depths, field.grid, *field.weights)
 
 
-class _Colors(torch.autograd.Function):
+class _Colors(Op):
     @staticmethod
     def forward(
         ctx: Context, points: Points, field: Field, rays: Rays, keep: bool, *tensors: torch.Tensor
@@ -84,7 +84,6 @@ class _Colors(torch.autograd.Function):
         return result
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         positions, depths, directions, focal, table, resolutions, encoded, packed, clamped, *weights = ctx.saved_tensors
         need_positions, need_depths, need_grid = ctx.needs_input_grad[4:7]

@@ -7,7 +7,7 @@ import torch
 from nexwarp.errors import check_tensors
 from nexwarp.kernels import photometric as kernels
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Context, contiguous, first_derivative, launch, needed, real_of
+from nexwarp.ops._interop import Context, Op, contiguous, launch, real_of
 
 Factors = tuple[float, float, float]
 
@@ -53,7 +53,7 @@ def _warp_sums(like: torch.Tensor, rows: int, count: int) -> tuple[torch.Tensor,
     return like.new_empty(rows, -(-count // warp)), -(-count // warp) * warp
 
 
-class _Photometric(torch.autograd.Function):
+class _Photometric(Op):
     @staticmethod
     def forward(
         ctx: Context, factors: Factors, saturation: float, *tensors: torch.Tensor | None
@@ -69,7 +69,6 @@ class _Photometric(torch.autograd.Function):
         return tuple(term if factor else None for term, factor in zip(sums.sum(1).unbind(), factors, strict=True))
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, *grads: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         tensors = ctx.saved_tensors
         like = next(x for x in tensors if x is not None)
@@ -99,7 +98,7 @@ def expose(
     return _Expose.apply(saturation, *contiguous(image, textured, exposure, photo))
 
 
-class _Expose(torch.autograd.Function):
+class _Expose(Op):
     @staticmethod
     def forward(ctx: Context, saturation: float, *tensors: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         image, textured, exposure, photo = tensors
@@ -111,7 +110,6 @@ class _Expose(torch.autograd.Function):
         return exposed, exposed_colors
 
     @staticmethod
-    @first_derivative
     def backward(
         ctx: Context, grad_exposed: torch.Tensor | None, grad_exposed_colors: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:
@@ -149,7 +147,7 @@ def depth_term(
     return _DepthTerm.apply(factor, *contiguous(depths, weights, expected, places))
 
 
-class _DepthTerm(torch.autograd.Function):
+class _DepthTerm(Op):
     @staticmethod
     def forward(ctx: Context, factor: float, *tensors: torch.Tensor | None) -> torch.Tensor:
         depths, _weights, expected, _places = tensors
@@ -162,10 +160,9 @@ class _DepthTerm(torch.autograd.Function):
         return totals[0] / totals[1].clamp_min(1)
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         *tensors, totals = ctx.saved_tensors
         grads = [torch.empty_like(x) for x in tensors[:2]]
         inputs, pixels = [*tensors, ctx.rest, totals, grad], grads[0].shape[0] * grads[0].shape[1]
         launch(totals, kernels.depth_errors_backward, pixels, inputs, grads)
-        return None, *needed(grads, ctx.needs_input_grad[1:3]), None, None
+        return None, *grads, None, None

@@ -6,7 +6,7 @@ import torch
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels import project as kernels
-from nexwarp.ops._interop import Context, first_derivative, launch, needed
+from nexwarp.ops._interop import Context, Op, launch
 
 # Shapes of activated surfels, as `errors.check_tensors` takes them.
 GEOMETRY: dict[str, tuple[int | str, ...]] = {
@@ -57,7 +57,7 @@ def project(
     return Projection(*_Project.apply(*(x.contiguous() for x in tensors)))
 
 
-class _Project(torch.autograd.Function):
+class _Project(Op):
     @staticmethod
     def forward(ctx: Context, *inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
         means, *shape, colors, viewmat = inputs
@@ -71,7 +71,6 @@ class _Project(torch.autograd.Function):
         return records, centers, limits
 
     @staticmethod
-    @first_derivative
     def backward(
         ctx: Context, grad_records: torch.Tensor | None, _centers: None, _limits: None
     ) -> tuple[torch.Tensor | None, ...]:
@@ -87,4 +86,4 @@ class _Project(torch.autograd.Function):
         outputs = [(*grads, grad_means, grad_colors), grad_viewmats]
         launch(means, kernels.project_backward, count, inputs, outputs)
         grad_viewmat = None if grad_viewmats is None else grad_viewmats.sum(0)
-        return needed([grad_means, *grads, grad_colors, grad_viewmat], ctx.needs_input_grad)
+        return grad_means, *grads, grad_colors, grad_viewmat

@@ -4,7 +4,7 @@ import torch
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels import sh as kernels
-from nexwarp.ops._interop import Context, first_derivative, launch, needed
+from nexwarp.ops._interop import Context, Op, launch
 
 
 def plain_colors(
@@ -32,7 +32,7 @@ def plain_colors(
     return _PlainColors.apply(*(x.contiguous() for x in (sh0, shN, means, position)), degree)
 
 
-class _PlainColors(torch.autograd.Function):
+class _PlainColors(Op):
     @staticmethod
     def forward(
         ctx: Context, sh0: torch.Tensor, shN: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int
@@ -44,7 +44,6 @@ class _PlainColors(torch.autograd.Function):
         return colors
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, grad_colors: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         shN, means, position, colors = ctx.saved_tensors
         need_sh0, need_shN, need_means, need_position, _ = ctx.needs_input_grad
@@ -61,4 +60,4 @@ class _PlainColors(torch.autograd.Function):
             launch(means, kernels.plain_rays_backward, count, [shN, *seen], [grad_means], degree=degree)
             # A ray is the surfel's centre minus the camera's.
             grad_position = -grad_means.sum(0) if need_position else None
-        return needed((grad_sh0, grad_shN, grad_means, grad_position, None), ctx.needs_input_grad)
+        return grad_sh0, grad_shN, grad_means, grad_position, None

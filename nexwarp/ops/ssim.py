@@ -4,7 +4,7 @@ import torch
 
 from nexwarp.errors import check_tensors
 from nexwarp.kernels.ssim import C1, C2, REACH, THREADS, WINDOW_SIZE, blocks_of, gradient, score, tap
-from nexwarp.ops._interop import Context, first_derivative, launch, real_of
+from nexwarp.ops._interop import Context, Op, launch, real_of
 
 
 def weighted_dssim(image: torch.Tensor, target: torch.Tensor, factor: float = 1.0) -> torch.Tensor:
@@ -47,7 +47,7 @@ def _blur(maps: torch.Tensor) -> torch.Tensor:
     return across[0].permute(1, 2, 0)
 
 
-class _KernelDSSIM(torch.autograd.Function):
+class _KernelDSSIM(Op):
     @staticmethod
     def forward(ctx: Context, image: torch.Tensor, target: torch.Tensor, factor: float) -> torch.Tensor:
         derivatives = image.new_empty(3, image.numel()) if ctx.needs_input_grad[0] else None
@@ -62,7 +62,6 @@ class _KernelDSSIM(torch.autograd.Function):
         return losses.sum()
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, grad_loss: torch.Tensor) -> tuple[torch.Tensor, None, None]:
         image, target, derivatives = ctx.saved_tensors
         height, width = image.shape[0], 3 * image.shape[1]

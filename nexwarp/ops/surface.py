@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 
 from nexwarp.kernels import surface as kernels
-from nexwarp.ops._interop import Context, contiguous, first_derivative
+from nexwarp.ops._interop import Context, Op, contiguous
 from nexwarp.ops.collect import Hits, SlotSums, Walked
 from nexwarp.ops.project import Projection
 
@@ -46,7 +46,7 @@ def walk_surface(records: torch.Tensor, scene: Walked, stops: torch.Tensor) -> t
     return _Surface.apply(records, scene, stops)
 
 
-class _Surface(torch.autograd.Function):
+class _Surface(Op):
     @staticmethod
     def forward(ctx: Context, records: torch.Tensor, scene: Walked, stops: torch.Tensor) -> tuple[torch.Tensor, ...]:
         shape = (scene.camera.height, scene.camera.width)
@@ -62,7 +62,6 @@ class _Surface(torch.autograd.Function):
         return expected, median, top, normals
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, *grads: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         stops, expected, normals, totals, picks = ctx.saved_tensors
         scene: Walked = ctx.rest

@@ -17,12 +17,11 @@ from typing import NamedTuple
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from nexwarp import ops
 from nexwarp.kernels.mlp import POINTS, THREADS, layer_kernel
 from nexwarp.kernels.types import types
-from nexwarp.ops._interop import Context
+from nexwarp.ops._interop import Context, Op
 from nexwarp.ops.collect import Walked
 from nexwarp.ops.neural_field import Field, Points, Rays
 from nexwarp.ops.project import Pinhole, Projection
@@ -253,7 +252,7 @@ def mlp(tape: wp.Tape, matrices: Sequence[wp.array], features: wp.array) -> wp.a
     return features
 
 
-class _Colors(torch.autograd.Function):
+class _Colors(Op):
     @staticmethod
     def forward(ctx: Context, coefficients: torch.Tensor, rays: Rays, directions: torch.Tensor) -> torch.Tensor:
         colors = directions.new_empty(coefficients.shape[1], 3)
@@ -263,7 +262,6 @@ class _Colors(torch.autograd.Function):
         return colors
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         (coefficients,) = ctx.saved_tensors
         signal = torch.empty_like(coefficients)

@@ -11,15 +11,7 @@ import warp as wp
 from nexwarp.kernels.hashgrid import hashgrid, hashgrid_backward
 from nexwarp.kernels.sh import textured_colors, textured_colors_backward
 from nexwarp.ops import fused_texture, mlp
-from nexwarp.ops._interop import (
-    STORAGES,
-    Argument,
-    Context,
-    Names,
-    first_derivative,
-    launch,
-    sums_in_fixed_point,
-)
+from nexwarp.ops._interop import STORAGES, Argument, Context, Names, Op, launch, sums_in_fixed_point
 from nexwarp.ops.neural_field import Field, Points, Rays, gradient_scales
 
 # Runs of levels that CPU threads share out in the backward pass.
@@ -65,7 +57,7 @@ def _colors_in_parts(points: Points, field: Field, rays: Rays) -> torch.Tensor:
     return colors
 
 
-class _Texture(torch.autograd.Function):
+class _Texture(Op):
     @staticmethod
     def forward(
         ctx: Context, points: Points, field: Field, rays: Rays | None, keep: bool, *tensors: torch.Tensor | None
@@ -89,7 +81,6 @@ class _Texture(torch.autograd.Function):
         return colors
 
     @staticmethod
-    @first_derivative
     def backward(ctx: Context, grad: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         positions, depths, focal, directions, resolutions, table, coefficients, *rest = ctx.saved_tensors
         rays, count = ctx.rest

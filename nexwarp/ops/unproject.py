@@ -3,7 +3,7 @@
 import torch
 
 from nexwarp.kernels import unproject as kernels
-from nexwarp.ops._interop import Context, contiguous, first_derivative, launch
+from nexwarp.ops._interop import Context, Op, contiguous, launch
 from nexwarp.ops.project import Pinhole
 
 
@@ -18,7 +18,7 @@ def unproject(
     return _Unproject.apply(*contiguous(depths, viewmat, factors), camera)
 
 
-class _Unproject(torch.autograd.Function):
+class _Unproject(Op):
     @staticmethod
     def forward(
         ctx: Context, depths: torch.Tensor, viewmat: torch.Tensor, factors: torch.Tensor | None, camera: Pinhole
@@ -37,7 +37,6 @@ class _Unproject(torch.autograd.Function):
         return positions, directions
 
     @staticmethod
-    @first_derivative
     def backward(
         ctx: Context, grad_positions: torch.Tensor | None, grad_directions: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:
