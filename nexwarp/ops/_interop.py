@@ -46,10 +46,10 @@ class _Gradients(torch.autograd.Function):
 
 
 class Op(torch.autograd.Function):
-    """An op with a first derivative: differentiating the gradients that its backward pass returns raises.
+    """An op whose backward pass is given the gradient of at least one output; differentiating what it returns raises.
 
-    Torch's `once_differentiable` takes them for constants where the incoming ones are, or where `torch.autograd.grad`
-    asks for the gradients of some tensors alone.
+    Torch's `once_differentiable` takes gradients for constants where the incoming ones are, or where
+    `torch.autograd.grad` asks for the gradients of some tensors alone.
     """
 
     def __init_subclass__(cls) -> None:
@@ -57,6 +57,8 @@ class Op(torch.autograd.Function):
 
         @functools.wraps(backward)
         def marked(ctx: Context, *signals: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+            if all(x is None for x in signals):
+                return (None,) * len(ctx.needs_input_grad)
             with torch.no_grad():
                 grads = backward(ctx, *signals)
             if not torch.is_grad_enabled():

@@ -37,8 +37,6 @@ class _Compose(Op):
         ctx: Context, grad_image: torch.Tensor | None, grad_textured: torch.Tensor | None
     ) -> tuple[torch.Tensor | None, ...]:
         colors, weights, alpha, background = ctx.saved_tensors
-        if grad_image is None and grad_textured is None:
-            return (None,) * 6
         need_plain, *needed, need_background = ctx.needs_input_grad
         shapes = ((*alpha.shape, 3), colors.shape, weights.shape, alpha.shape)
         grads = [weights.new_empty(s) if need else None for s, need in zip(shapes, needed, strict=True)]

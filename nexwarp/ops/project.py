@@ -72,10 +72,8 @@ class _Project(Op):
 
     @staticmethod
     def backward(
-        ctx: Context, grad_records: torch.Tensor | None, _centers: None, _limits: None
+        ctx: Context, grad_records: torch.Tensor, _centers: None, _limits: None
     ) -> tuple[torch.Tensor | None, ...]:
-        if grad_records is None:
-            return (None,) * 7
         means, quats, scales, viewmat = ctx.saved_tensors
         count = len(means)
         grad_means, grad_colors = torch.empty_like(means), torch.empty_like(means)

@@ -42,8 +42,6 @@ class _Unproject(Op):
     ) -> tuple[torch.Tensor | None, ...]:
         depths, factors, viewmat = ctx.saved_tensors
         need_depths, need_viewmat, *_ = ctx.needs_input_grad
-        if grad_positions is None and grad_directions is None:
-            return (None,) * 4
         camera, pixels = ctx.rest, depths.shape[0] * depths.shape[1]
         grad_depths = torch.empty_like(depths) if need_depths else None
         # A slot a pixel, then one sum: no contention, and a fixed order.
