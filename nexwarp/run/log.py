@@ -6,6 +6,7 @@ import os
 import re
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -35,7 +36,6 @@ class TrainingLog:
         self.trainer = trainer
         self.tensorboard = tensorboard
         self.every = max(min(EVERY, trainer.config.iterations // MIN_LINES), 1)
-        self.file: TextIO | None = None
         self.events: Any = None
 
     def __enter__(self) -> "TrainingLog":
@@ -46,29 +46,23 @@ class TrainingLog:
             hidden = self.trainer.iteration + 1 if self.trainer.iteration else None
             self.events = SummaryWriter(str(self.path.parent / TENSORBOARD_FOLDER), purge_step=hidden)
         keep_lines(self.path, self.trainer.iteration)
-        self.file = _open_log(self.path)
         self.last = self.trainer.iteration
         self.written = time.perf_counter()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        for file in (self.file, self.events):
-            try:
-                if file is not None:
-                    file.close()
-            except OSError:  # a full disk: an exception that is already being raised must not be replaced
-                if kind is None:
-                    raise
+    def __exit__(self, *_: object) -> None:
+        if self.events is not None:
+            with suppress(OSError):  # of a full disk, which writing a line has told
+                self.events.close()
 
     def __call__(self, step: StepReport) -> None:
         """Write a line if one is due after this step."""
         # Lines at 1, 1 + every, ...: steps at round numbers are often special, such as those of density control.
         if (step.iteration - 1) % self.every >= step.views and step.iteration != self.trainer.config.iterations:
             return
-        assert self.file is not None
         line = {name: finite(value) for name, value in self._line(step).items()}
-        self.file.write(json.dumps(line, allow_nan=False) + "\n")
-        self.file.flush()
+        with _open_log(self.path) as file:
+            file.write(json.dumps(line, allow_nan=False) + "\n")
         if self.events is not None:
             for name, value in _scalars(line).items():
                 self.events.add_scalar(name, value, step.iteration)
