@@ -26,7 +26,7 @@ from nexwarp.kernels.types import TileLists, func_per_real, per_real
 from nexwarp.kernels.walk import block_of, overflowed, pixel_of, stage, tile_of, walk
 from nexwarp.native.staging import BLOCK_DIM, staged_name, staged_record
 from nexwarp.native.vector_loads import load_record, record_row
-from nexwarp.native.warp import any_in_warp, lane_index, warp_size
+from nexwarp.native.warp import any_in_warp, warp_size
 
 
 @func_per_real
@@ -113,22 +113,19 @@ def collect(first: int, surfels: Surfels, lists: TileLists, view: View, hits: Hi
     overflow = overflowed(lists)
     bounds = walk(tile_of(thread), lists, overflow)
     stop = int(bounds[0])
-    width = warp_size()
-    lane = lane_index()
-    for batch in range(bounds[0], bounds[1], width):
+    for batch in range(bounds[0], bounds[1], warp_size()):
         if any_in_warp(wp.where(transmittance >= TRANSMITTANCE_MIN, 1, 0)) == 0:
             break
-        staged = stage(batch + lane, bounds[1], surfels, lists, overflow, middle, half)
-        for slot in range(staged[0]):
-            name = staged_name(slot, staged[1], batch)
-            i = name[0]
+        count, mine = stage(batch, bounds[1], surfels, lists, overflow, middle, half)
+        for slot in range(count):
+            i, k = staged_name(slot, mine, batch)
             a, b, n, c = staged_record(slot, surfels.records, i)
             u, v, depth = hit(a, b, n, c[3], d)
             alpha = alpha_if_near(u, v, surfels.limits[i], a[3], b[3], n[3])
             if alpha >= ALPHA_MIN and depth > view.near and transmittance >= TRANSMITTANCE_MIN:
                 weight = alpha * transmittance
                 transmittance = transmittance * (ONE - alpha)
-                stop = name[1] + 1
+                stop = k + 1
                 if wp.static(max_hits > 0):
                     if weight > weights[wp.static(max_hits - 1)]:
                         # Insert the hit before the first lighter one, and move that and all behind it down by one,

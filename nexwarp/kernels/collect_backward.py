@@ -154,14 +154,11 @@ def collect_backward(
     overflow = overflowed(lists)
     bounds = walk(tile_of(thread), lists, overflow)
     width = warp_size()
-    lane = lane_index()
     last = wp.min(warp_max(stop), bounds[1])
     for batch in range(bounds[0], last, width):
-        staged = stage(batch + lane, last, surfels, lists, overflow, middle, half)
-        for slot in range(staged[0]):
-            name = staged_name(slot, staged[1], batch)
-            i = name[0]
-            k = name[1]
+        count, mine = stage(batch, last, surfels, lists, overflow, middle, half)
+        for slot in range(count):
+            i, k = staged_name(slot, mine, batch)
             a, b, n, c = staged_record(slot, surfels.records, i)
             u, v, depth = hit(a, b, n, c[3], d)
             # A CPU skips at once what certainly does not count. Behind that, alpha is computed straight on, so that

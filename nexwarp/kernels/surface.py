@@ -35,7 +35,7 @@ from nexwarp.kernels.surfel import facing_side, hit, hit_gradients, record_gradi
 from nexwarp.kernels.types import FixedSums, TileLists, ints, per_real
 from nexwarp.kernels.walk import block_of, overflowed, pixel_of, stage, tile_of, walk
 from nexwarp.native.staging import BLOCK_DIM, staged_name, staged_record
-from nexwarp.native.warp import any_in_warp, lane_index, warp_max, warp_size
+from nexwarp.native.warp import any_in_warp, warp_max, warp_size
 
 
 @per_real(grid_stride=False, fast_math=True, launch_bounds=BLOCK_DIM)
@@ -56,15 +56,11 @@ def surface(first: int, surfels: Surfels, lists: TileLists, view: View, stops: i
     pick = wp.vec2i(-1, -1)
     overflow = overflowed(lists)
     bounds = walk(tile_of(thread), lists, overflow)
-    width = warp_size()
-    lane = lane_index()
     last = wp.min(warp_max(stop), bounds[1])
-    for batch in range(bounds[0], last, width):
-        staged = stage(batch + lane, last, surfels, lists, overflow, middle, half)
-        for slot in range(staged[0]):
-            name = staged_name(slot, staged[1], batch)
-            i = name[0]
-            k = name[1]
+    for batch in range(bounds[0], last, warp_size()):
+        count, mine = stage(batch, last, surfels, lists, overflow, middle, half)
+        for slot in range(count):
+            i, k = staged_name(slot, mine, batch)
             if k < stop:
                 a, b, n, c = staged_record(slot, surfels.records, i)
                 u, v, depth = hit(a, b, n, c[3], d)
@@ -125,15 +121,11 @@ def surface_backward(
     transmittance = real(1.0)
     overflow = overflowed(lists)
     bounds = walk(tile_of(thread), lists, overflow)
-    width = warp_size()
-    lane = lane_index()
     last = wp.min(warp_max(stop), bounds[1])
-    for batch in range(bounds[0], last, width):
-        staged = stage(batch + lane, last, surfels, lists, overflow, middle, half)
-        for slot in range(staged[0]):
-            name = staged_name(slot, staged[1], batch)
-            i = name[0]
-            k = name[1]
+    for batch in range(bounds[0], last, warp_size()):
+        count, mine = stage(batch, last, surfels, lists, overflow, middle, half)
+        for slot in range(count):
+            i, k = staged_name(slot, mine, batch)
             a, b, n, c = staged_record(slot, surfels.records, i)
             u, v, depth = hit(a, b, n, c[3], d)
             alpha = alpha_if_near(u, v, surfels.limits[i], a[3], b[3], n[3])

@@ -16,7 +16,7 @@ from nexwarp.kernels.surfel import intrinsics_of, ray_through
 from nexwarp.kernels.types import Real, Surfels, TileLists, Vec2, Vec4, View
 from nexwarp.native.staging import stage_record
 from nexwarp.native.vector_loads import record_row
-from nexwarp.native.warp import ballot, lanes_below, population, sync_warp, tile_size, warp_size
+from nexwarp.native.warp import ballot, lane_index, lanes_below, population, sync_warp, tile_size, warp_size
 
 # Half of the distances between the outer pixel centres of a block, and a little.
 HALF_WIDTH = wp.constant(wp.float64(3.51))
@@ -125,11 +125,12 @@ def misses_block(i: int, surfels: Surfels, d: Vec2, half: Vec2):
 
 
 @wp.func
-def stage(k: int, end: int, surfels: Surfels, lists: TileLists, overflow: wp.bool, middle: Vec2, half: Vec2):
-    """Stage the surfels at the lanes' places k before the walk's end, on CUDA but those that miss the whole block.
+def stage(batch: int, end: int, surfels: Surfels, lists: TileLists, overflow: wp.bool, middle: Vec2, half: Vec2):
+    """Stage a warp's surfels from the place `batch` of the walk on, on CUDA but those that miss the whole block.
 
     Return (number of surfels staged, this lane's surfel, -1 if it is not staged).
     """
+    k = batch + lane_index()
     i = int(-1)
     if k < end:
         i = surfel_at(k, lists, overflow)
@@ -141,4 +142,4 @@ def stage(k: int, end: int, surfels: Surfels, lists: TileLists, overflow: wp.boo
     if i >= 0:
         stage_record(lanes_below(chosen), i, k, surfels.records)
     sync_warp()
-    return wp.vec2i(population(chosen), i)
+    return population(chosen), i

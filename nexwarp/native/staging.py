@@ -66,7 +66,8 @@ def stage_record(slot: wp.int32, i: wp.int32, place: wp.int32, records: Any):
 @wp.func
 def staged_name(slot: wp.int32, i: wp.int32, place: wp.int32):
     """(surfel, place) of a slot; on a CPU, those given."""
-    return _access_name(1, slot, i, place)
+    name = _access_name(1, slot, i, place)
+    return name[0], name[1]
 
 
 @wp.func
