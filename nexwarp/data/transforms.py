@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from nexwarp.cameras.camera import ROTATION_TOLERANCE
 from nexwarp.cameras.nerfstudio import intrinsics_of, list_of, matrix_of, merged, number_of
 from nexwarp.data.capture import (
     Capture,
@@ -45,7 +46,6 @@ FRAME_KEYS = {"file_path", "transform_matrix", "mask_path", "depth_file_path"}
 HARMLESS = {"aabb", "aabb_scale", "scale", "offset", "up", "sharpness", "rotation", "colmap_im_id"}
 AGREEMENT = 2.0  # ratio of colour errors from which points count as being in the original world
 JUDGED_PHOTOS, JUDGED_POINTS = 5, 5000
-ROTATION_TOLERANCE = 1e-3  # that of Camera
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 RADIAL_TANGENTIAL = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of COLMAP's FULL_OPENCV
 FISHEYE = ("k1", "k2", "k3", "k4")
