@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 import tyro
@@ -16,17 +16,14 @@ from rich.console import Console
 
 from nexwarp.cli import display
 from nexwarp.cli.options import Device_, Host_, Port_, Run_, pick_device
-from nexwarp.data import View
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import DEMO, SceneSource, scene_kinds
 from nexwarp.data.sfm import SfmOptions, process
 from nexwarp.data.sfm.photos import FILMS, OTHERS, SUFFIXES
 from nexwarp.data.sfm.process import FRAMES, REPORT_FILE, source_identity
 from nexwarp.errors import FormatError, MissingError, RunError, SceneError
-from nexwarp.export.bake import Progress
 from nexwarp.io.json_files import READ_ERRORS, Json, finite, read_object, write_json
 from nexwarp.model.edit import write_edits
-from nexwarp.model.model import Model
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.run.edit import EditOrder, added, crop_command, described, measured
 from nexwarp.run.evaluate import check_metrics, evaluate
@@ -155,8 +152,15 @@ class Eval:
             if self.refine_poses:
                 views, moves = fit_poses(model, views, progress=partial(observe, "fitting test poses"))
                 facts["test_poses"] = {**moves}
-            options = {"mask_mode": (opened.config or DEFAULT).mask_mode, "metrics": self.metrics}
-            results = evaluate_run(model, views, opened.folder, facts, observe, **options)
+            results = evaluate(
+                model,
+                views,
+                renders=opened.folder / RENDERS_FOLDER,
+                mask_mode=(opened.config or DEFAULT).mask_mode,
+                metrics=self.metrics,
+                progress=partial(observe, "evaluating"),
+            )
+            write_json(opened.folder / METRICS_FILE, finite(facts | results))
         rows = figures(results, self.metrics)
         fitted = ", poses fitted to their photos" if self.refine_poses else ""
         console.print(display.results_table(rows, f"{source.name}: {len(scene.test)} test views{fitted}"))
@@ -173,22 +177,6 @@ def figures(results: Mapping[str, Json], metrics: Sequence[str] = ("psnr", "ssim
             text = "not available" if value is None else f"{value:.4f}"
         rows[f"test {name.upper()}"] = text
     return rows
-
-
-def evaluate_run(
-    model: Model,
-    views: Sequence[View],
-    run: Path,
-    facts: dict[str, Json],
-    observe: Progress,
-    **options: Any,
-) -> dict[str, Json]:
-    """Evaluate a model on test views and write metrics.json with `facts`; return its entries. See `evaluate`."""
-    progress = partial(observe, "evaluating")
-    results = evaluate(model, views, renders=run / RENDERS_FOLDER, progress=progress, **options)
-    entries = facts | cast(dict[str, Json], results)
-    write_json(run / METRICS_FILE, finite(entries))
-    return entries
 
 
 @dataclass

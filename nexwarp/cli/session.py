@@ -8,22 +8,22 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from rich.console import Console
 
 from nexwarp.cameras.cameras_file import CAMERAS_FILE, save_cameras
 from nexwarp.cli import display
-from nexwarp.cli.commands import evaluate_run, figures
+from nexwarp.cli.commands import figures
 from nexwarp.cli.signals import Stopped, stopped_by_signals
 from nexwarp.data import Scene
 from nexwarp.errors import DivergedError, OutOfMemoryError, RunError, StorageError
-from nexwarp.io.json_files import Json, write_json
+from nexwarp.io.json_files import Json, finite, write_json
 from nexwarp.machine import needed_memory
 from nexwarp.model.model import Model
 from nexwarp.model.model_file import MODEL_FILE, load, save_model
-from nexwarp.run.evaluate import Values, evaluate
+from nexwarp.run.evaluate import evaluate
 from nexwarp.run.folder import (
     COMPARE,
     METRICS_FILE,
@@ -159,10 +159,20 @@ class Session(StageStore):
         return sum(each.work(photos) for each in coming) - stage.config.iterations + evaluation
 
     def finish(self, stage: Stage, trainer: Trainer) -> Model:
-        """Finish, write and return the model of a trained stage; that of the run is also evaluated."""
+        """Finish, write and return the model of a trained stage; that of the run is also evaluated, by all ranks."""
         complete = f"{stage.name} is complete and saved: --resume finishes the run"
+        file: Path | None = None
+        facts: dict[str, Json] = {}
         try:
-            model = self._write(stage, trainer) if self.ranks.first else self._finish_with_others(stage, trainer)
+            if self.ranks.first:
+                file, facts = self._save(stage, trainer)
+            elif trainer.graphs is not None:
+                trainer.graphs.clear()  # NCCL waits, when it ends, for graphs that hold its all-reduce
+            model = shared_model(file, self.ranks)
+            if not stage.teacher:
+                self._evaluate(trainer, model, facts)
+            elif self.ranks.first:
+                write_json(self._folder(stage) / METRICS_FILE, facts)
         except OSError as error:
             raise StorageError(f"{error}; {complete}") from error
         except (MemoryError, RuntimeError) as error:
@@ -193,13 +203,15 @@ class Session(StageStore):
             raise RunError(f"{folder}: expected the complete teacher that the student in {self.run} has learned from")
         return None
 
-    def _write(self, stage: Stage, trainer: Trainer) -> Model:
-        """Finish and write the model of a stage, its cameras and figures; a student's have the time of its teachers."""
+    def _save(self, stage: Stage, trainer: Trainer) -> tuple[Path, dict[str, Json]]:
+        """Finish and write the model of a stage, and its cameras; return its file, and entries for metrics.json.
+
+        The time of a student has that of its teachers.
+        """
         folder = self._folder(stage)
         with display.stages(self.console) as observe:
-            finished = trainer.finish(observe)
-        file = save_model(folder, finished)
-        model = shared_model(file, self.ranks)
+            model = trainer.finish(observe)
+        file = save_model(folder, model)
         given = trainer.scene.cameras
         refined = {view.name: view.camera for view in trainer.views.refined(trainer.poses)}
         save_cameras(folder / CAMERAS_FILE, given | {TRAIN: refined}, given)
@@ -214,24 +226,23 @@ class Session(StageStore):
         }
         if trainer.targets.teachers:
             facts["teachers"] = len(trainer.targets.teachers)
-        facts |= {"surfels": len(model.surfels), "megabytes": file.stat().st_size / 1e6}
-        if stage.teacher:
-            write_json(folder / METRICS_FILE, facts)
-        else:
-            self._evaluate(trainer, model, facts)
-        return model
+        return file, facts | {"surfels": len(model.surfels), "megabytes": file.stat().st_size / 1e6}
 
     def _evaluate(self, trainer: Trainer, model: Model, facts: dict[str, Json]) -> None:
-        """Evaluate the run's model on the test views, if there are any, and on the photos; print the figures."""
-        views = trainer.scene.test
-        rows = {}
-        judged = self._judged_photos(trainer, model)
-        if views:
-            options = {"mask_mode": trainer.config.mask_mode, "ranks": self.ranks}
-            with display.stages(self.console) as observe:
-                entries = evaluate_run(model, views, self.run, facts, observe, **options)
-            rows = figures(entries)
-            judged |= cast(dict[str, Values], entries["views"])
+        """Evaluate the run's model on the photos, and on the test views if there are any; rank 0 writes the figures."""
+        views, photos, rows = trainer.scene.test, trainer.views.refined(trainer.poses), dict[str, str]()
+        options: dict[str, Any] = {"mask_mode": trainer.config.mask_mode, "ranks": self.ranks}
+        with display.stages(self.console) as observe:
+            told = partial(observe, "judging photos")
+            judged = evaluate(model, photos, metrics=("psnr",), progress=told, **options)["views"]
+            if views:
+                told, renders = partial(observe, "evaluating"), self.run / RENDERS_FOLDER
+                results = evaluate(model, views, renders=renders, progress=told, **options)
+                rows, judged = figures(results), judged | results["views"]
+                if self.ranks.first:
+                    write_json(self.run / METRICS_FILE, finite(facts | results))
+        if not self.ranks.first:
+            return
         save_photo_table(self.run / PHOTOS_FILE, {TRAIN: trainer.scene.train, TEST: views}, judged)
         rows |= {
             "surfels": f"{len(model.surfels):,}",
@@ -243,26 +254,6 @@ class Session(StageStore):
         if views:
             strip = self.run / RENDERS_FOLDER / COMPARE / picture_name(views[0].name)
             self.console.print(f"photo, render, error: {strip}")
-
-    def _finish_with_others(self, stage: Stage, trainer: Trainer) -> Model:
-        """Return the model that rank 0 has finished; render a share of the test views for it."""
-        if trainer.graphs is not None:
-            trainer.graphs.clear()  # NCCL waits, when it ends, for graphs that hold its all-reduce
-        model = shared_model(None, self.ranks)
-        if not stage.teacher:
-            self._judged_photos(trainer, model)
-        if trainer.scene.test and not stage.teacher:
-            evaluate(model, trainer.scene.test, mask_mode=trainer.config.mask_mode, ranks=self.ranks)
-        return model
-
-    @torch.no_grad()
-    def _judged_photos(self, trainer: Trainer, model: Model) -> dict[str, Values]:
-        """Return the PSNR of the training photos; all ranks render a share."""
-        views = trainer.views.refined(trainer.poses)
-        mode, ranks = trainer.config.mask_mode, self.ranks
-        with display.stages(self.console) as observe:
-            told = partial(observe, "judging photos")
-            return evaluate(model, views, mask_mode=mode, metrics=("psnr",), progress=told, ranks=ranks)["views"]
 
 
 @contextmanager
