@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -166,21 +166,17 @@ class Train:
 
     def _plan(self, run: Path, ranks: Ranks, claim: ExitStack) -> tuple[RunRecord, bool]:
         """Claim the run folder, on rank 0; return the run, the same on all ranks, and whether to resume it."""
-        record = None
-        resume = False
+        told: dict[str, Any] = {}
         if ranks.first:
             self._check()
             claimed = claimed_run(run, self.scene, resume=self.resume, overwrite=self.overwrite)
             resume = claim.enter_context(claimed)
-            record = self._record(run, resume, ranks)
-        if ranks.size > 1:
-            shared = ranks.share(None if record is None else {"run": record.as_dict(), "resume": resume})
-            assert isinstance(shared, dict)
-            record = RunRecord.from_dict(shared["run"])
-            resume = bool(shared["resume"])
-        assert record is not None
+            told = {"run": self._record(run, resume, ranks).as_dict(), "resume": resume}
+        told = ranks.share(told)
+        record = RunRecord.from_dict(told["run"])
         # On another machine, the scene may lie elsewhere.
-        return dataclasses.replace(record, source=dataclasses.replace(record.source, path=self.scene.path)), resume
+        source = dataclasses.replace(record.source, path=self.scene.path)
+        return dataclasses.replace(record, source=source), bool(told["resume"])
 
     def _record(self, run: Path, resume: bool, ranks: Ranks) -> RunRecord:
         """Return the run of the options, which must agree with the run to resume."""
