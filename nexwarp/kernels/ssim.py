@@ -118,7 +118,7 @@ def place(thread: int, width: int):
     """(thread of its block, left column, top row) of the block's strip."""
     block = thread // THREADS
     strips = (width + COLUMNS - 1) // COLUMNS
-    return wp.vec3i(thread % THREADS, (block % strips) * COLUMNS, (block // strips) * ROWS)
+    return thread % THREADS, (block % strips) * COLUMNS, (block // strips) * ROWS
 
 
 @wp.func
@@ -237,9 +237,8 @@ def score(
 ):
     """Sums of (1 - s) scale, one a warp, and ds/dmx, ds/dq, ds/dp unless `derivatives` is null."""
     thread = first + wp.tid()
-    at = place(thread, width)
-    lane = at[0]
-    moments = blurred_moments(image, target, at[1] - 3 * REACH + lane, at[2], height, width)
+    lane, left, top = place(thread, width)
+    moments = blurred_moments(image, target, left - 3 * REACH + lane, top, height, width)
     for k in range(wp.static(MOMENTS)):
         put(k, lane, moments[k])
     sync_block()
@@ -248,12 +247,12 @@ def score(
     if lane < COLUMNS:
         for k in range(wp.static(MOMENTS)):
             moments[k] = blur(k, lane)
-        row = at[2] + lane // wp.static(COLUMNS // GROUP)
+        row = top + lane // wp.static(COLUMNS // GROUP)
         for o in range(wp.static(GROUP)):
             s = ssim(moments[0, o], moments[1, o], moments[2, o], moments[3, o])
             for k in range(3):
                 slopes[k, o] = s[k + 1]
-            if row < height and at[1] + group_column(lane) + 3 * o < width:
+            if row < height and left + group_column(lane) + 3 * o < width:
                 total += (1.0 - s[0]) * scale
     total = warp_sum(total)
     if lane_index() == 0:
@@ -265,7 +264,7 @@ def score(
         for k in range(3):
             put_group(k, lane, slopes[k])
     sync_block()
-    write_columns(derivatives, lane, at[1] + lane, at[2], height, width)
+    write_columns(derivatives, lane, left + lane, top, height, width)
 
 
 @wp.kernel(**OPTIONS)
@@ -281,9 +280,8 @@ def gradient(  # noqa: PLR0913  # a kernel entry point
     # outputs
     grad_image: reals,
 ):
-    at = place(first + wp.tid(), width)
-    lane = at[0]
-    slopes = blurred_slopes(derivatives, at[1] - 3 * REACH + lane, at[2], height, width)
+    lane, left, top = place(first + wp.tid(), width)
+    slopes = blurred_slopes(derivatives, left - 3 * REACH + lane, top, height, width)
     for k in range(3):
         put(k, lane, slopes[k])
     sync_block()
@@ -295,11 +293,11 @@ def gradient(  # noqa: PLR0913  # a kernel entry point
         for k in range(3):
             put_group(k, lane, slopes[k])
     sync_block()
-    column = at[1] + lane
+    column = left + lane
     if lane < COLUMNS and column < width:
         factor = -scale * grad_loss[0]
         for j in range(wp.static(ROWS)):
-            row = at[2] + j
+            row = top + j
             if row < height:
                 k = row * width + column
                 cells = j * THREADS + lane
