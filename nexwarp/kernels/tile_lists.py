@@ -31,11 +31,6 @@ def depth_keys(first: int, centers: vec3s, keys: wp.array(dtype=wp.uint32), indi
     indices[i] = i
 
 
-def list_threads(surfels: int, on_gpu: bool) -> int:
-    """Return how many threads count and emit take: on a GPU whole warps, which work together."""
-    return -(-surfels // 32) * 32 if on_gpu else surfels
-
-
 @wp.func
 def shared_row(place: int, rows: int, i: int, start: int, tile_columns: int, polygons: Any):
     """(surfel, tile row, first tile, number of tiles) of one of the warp's `rows` rows.

@@ -92,7 +92,7 @@ def intersect_tiles(
     inputs = [(*shape, means), viewmat.contiguous(), camera.K.contiguous(), camera.near, rows]
     launch(means, tile_polygon, count, inputs, [reaches, polygons])
     arguments = [order, polygons, wp.vec2i(columns, rows)]
-    threads = kernels.list_threads(count, means.is_cuda)
+    threads = -(-count // 32) * 32 if means.is_cuda else count  # on a GPU whole warps, which work together
     totals, ends = (torch.empty(count, dtype=x, device=means.device) for x in (torch.int64, torch.int32))
     launch(means, kernels.count, threads, arguments, [totals], sharing=UNEVEN)
     totals.cumsum_(0)
