@@ -45,7 +45,7 @@ from nexwarp.model.model import Model
 from nexwarp.model.model_file import save_model
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.run.edit import MIDDLE, edited, subject_crop
-from nexwarp.run.evaluate import compared, lpips_vgg, psnr, ssim, weights_file
+from nexwarp.run.evaluate import METRICS, compared, weights_file
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, METRICS_FILE, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
 from nexwarp.train.api import train
 from nexwarp.train.recipe import DEFAULT, MASK_MODES, MIN_SURFELS, with_settings
@@ -339,10 +339,9 @@ def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], 
     """Return metrics of a baked file and of the model on test views; LPIPS where its weights are at hand."""
     model = opened.model.to(device)
     file = next(file for file in files if file.suffix in (".html", GLB))
-    scene, exposures = load_baked(file).to(device), None
+    scene = load_baked(file).to(device)
     motion = opened.frame if file.suffix == GLB else IDENTITY
-    if scene.exposures is None and model.options.exposure == "photos":
-        exposures = model.exposures
+    exposures = model.exposures if scene.exposures is None and model.options.exposure == "photos" else None
 
     def shown(camera: Camera) -> torch.Tensor:
         if scene.exposures is not None:
@@ -350,15 +349,12 @@ def _quality(opened: OpenedModel, files: Sequence[Path], views: Sequence[View], 
         image = scene.render_at_mean(motion.camera(camera), model.options.background)
         return image if exposures is None else image * exposures.factors(camera.to(device))
 
+    metrics = ("psnr", "ssim", "lpips") if weights_file().is_file() else ("psnr", "ssim")
     figures: Figures = {}
     for name, render in (("baked", shown), ("neural", model.render_image)):
         pictures = [(render(view.camera).cpu(), view.image, view.mask) for view in views]
-        figures[name] = {
-            "psnr": fmean(psnr(*each) for each in pictures),
-            "ssim": fmean(ssim(*each) for each in pictures),
-        }
-        if weights_file().is_file():
-            figures[name]["lpips"] = fmean(value for each in pictures if (value := lpips_vgg(*each)) is not None)
+        judged = {metric: [METRICS[metric](*each) for each in pictures] for metric in metrics}
+        figures[name] = {metric: fmean(x for x in values if x is not None) for metric, values in judged.items()}
     overdraw = fmean(scene.overdraw(motion.camera(view.camera)) for view in views)
     figures["drawn"] = {"triangles": 2 * len(scene.boxes), "overdraw": overdraw}
     return figures
