@@ -136,7 +136,8 @@ def _in_child(order: Order, scene: Path, observe: Observer) -> SfmReport:
         except BaseException:
             child.kill()
             raise
-        child.wait()
+        finally:
+            child.wait()  # a `with` block waits a quarter of a second only after Ctrl-C
         words.seek(0)
         told = words.read().decode(errors="replace")
     if isinstance(answer, SfmReport):
