@@ -154,10 +154,7 @@ def check_values(name: str, tensor: torch.Tensor, low: float, high: float) -> No
         return
     least, most = tensor.aminmax()  # both are NaN if an element is
     if not (least >= low and most <= high):
-        where = tuple(torch.nonzero(~((tensor >= low) & (tensor <= high)))[0].tolist())
-        raise ValueError(
-            f"{name}: expected values from {low:g} to {high:g}, got {tensor[where].item():g} at index {where}"
-        )
+        check_each(name, (tensor >= low) & (tensor <= high), tensor, f"values from {low:g} to {high:g}")
 
 
 def check_version(value: object, known: int) -> None:
