@@ -30,7 +30,6 @@ SIDE = 4096  # texels of the atlas along an axis at most
 MAX_SIDE = 256  # texels of one surfel along one axis
 FILLED = 0.85  # fraction of the atlas that rectangles cover at most: packing leaves gaps
 TEXELS_AT_A_TIME = 2**20
-LARGEST_TEXEL = 1e6  # pixels
 UNCLIPPED = 0.98  # of the colours that 8 bits are to hold
 GROWTH = 1.05  # of texels, until all rectangles fit
 
@@ -44,6 +43,7 @@ class Observations:
     # (N, 4) u0, v0, u1, v1, in units of the scales: the box of all textured hits of some weight; u0 > u1 without any
     boxes: torch.Tensor
     pixels: torch.Tensor  # (N, 2) largest number of pixels that one scale covers along the surfel's x and y axes
+    influence: torch.Tensor  # (N,) sum over pixels of the squared blending weight: what its colours change in photos
     textured: torch.Tensor  # (N,) fraction of the surfel's blending weight that is textured
     directions: torch.Tensor  # (N, 3) mean direction from which it is seen, unit, world frame; 0 if no view sees it
 
@@ -65,7 +65,7 @@ class Layout:
         """Return the surfels (T,) int64 that have a texture."""
         return (self.boxes[:, 2] > self.boxes[:, 0]).nonzero()[:, 0]
 
-    def ends(self) -> torch.Tensor:
+    def spans(self) -> torch.Tensor:
         """Return the `rects` (N, 4) of a `BakedScene`: each first texel, and the way from it to the last one."""
         return torch.cat([self.rects[:, :2], self.rects[:, 2:] - 1], dim=1).float()
 
@@ -100,7 +100,7 @@ def bake(model: Model, views: Views, *, steps: int | None = None, progress: Prog
 def measure(model: Model, views: Views, progress: Progress = lambda *_: None) -> tuple[BakedScene, Observations]:
     """Return the scene with the first atlas, of the texture itself, before any fit, and what the views see."""
     seen = observe(model, cameras_of(views), partial(progress, "measuring surfels"))
-    return evaluate(model, seen, lay_out(seen.boxes, seen.pixels)), seen
+    return evaluate(model, seen, lay_out(seen.boxes, seen.pixels, seen.influence)), seen
 
 
 def points_on(surfels: Surfels | Activated, ids: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
@@ -130,7 +130,7 @@ def observe(
     untextured = Model(model.surfels, None, None, model.detail_limits, options, model.meta)
     count, means = len(model.surfels), model.surfels.means.detach()
     boxes = means.new_tensor([NOWHERE, NOWHERE, -NOWHERE, -NOWHERE]).repeat(count, 1)
-    pixels, total, textured = means.new_zeros(count, 2), means.new_zeros(count), means.new_zeros(count)
+    pixels, (influence, total, textured) = means.new_zeros(count, 2), means.new_zeros(3, count)
     directions, scales = means.new_zeros(count, 3), model.surfels.scales.detach()
     sides = axes(model.surfels.quats.detach())[:2]
     for done, camera in enumerate(cameras, 1):
@@ -147,6 +147,7 @@ def observe(
         local = torch.stack([(offsets * axis).sum(1) for axis in sides_of], dim=1) / scales[ids]
         rays = normalize(rays, dim=1)
         total.index_add_(0, ids, weights)
+        influence.index_add_(0, ids, weights.square())
         directions.index_add_(0, ids, weights[:, None] * rays)
         heavy = slots % MAX_HITS < kept
         textured.index_add_(0, ids, weights * heavy)
@@ -160,31 +161,35 @@ def observe(
         covered = scales[ids[heavy]] * (1 - cosines.square()).clamp_min(0).sqrt() / sizes[:, None]
         pixels.scatter_reduce_(0, pairs, covered, "amax")
         progress(done, len(cameras))
-    return Observations(boxes, pixels, textured / total.clamp_min(1e-12), normalize(directions, dim=-1))
+    return Observations(boxes, pixels, influence, textured / total.clamp_min(1e-12), normalize(directions, dim=-1))
 
 
-def lay_out(boxes: torch.Tensor, pixels: torch.Tensor, *, fewest: int = 2) -> Layout:
+def lay_out(boxes: torch.Tensor, pixels: torch.Tensor, influence: torch.Tensor, *, fewest: int = 2) -> Layout:
     """Give each surfel with a box (N, 4) of u1 > u0, in units of the scales, a rectangle.
 
-    One scale covers `pixels` (N, 2) along either axis. A texel is a pixel large, or as large as the atlas needs to hold
-    all of them. A surfel has `fewest` texels along an axis where there is room.
+    One scale covers `pixels` (N, 2) along either axis. A texel is a pixel large; where the atlas is too small for that,
+    each surfel gets texels in proportion to its `influence` (N,). A surfel has `fewest` texels along an axis where
+    there is room.
     """
     textured = boxes[:, 2] > boxes[:, 0]
     boxes = boxes.where(textured[:, None], 0.0)
     covered = ((boxes[:, 2:] - boxes[:, :2]) * pixels)[textured].double().cpu()
+    # Size of texels, in pixels, at one texel for each unit of influence.
+    coarseness = ((covered + 1).prod(1) / influence[textured].double().cpu().clamp_min(1e-6)).sqrt()
     fewest = max(min(fewest, int(math.sqrt(FILLED * SIDE * SIDE / max(len(covered), 1)))), 2)
-    texel = 1.0  # pixels
+    factor = 1 / max(float(coarseness.max()), 1e-12) if len(covered) else 1.0
     while True:
-        sizes = ((covered / texel).ceil() + 1).clamp(fewest, MAX_SIDE).int()
+        sizes = (covered / (factor * coarseness).clamp_min(1)[:, None]).ceil() + 1
+        sizes = sizes.clamp(fewest, MAX_SIDE).int()
         area = int(sizes.long().prod(1).sum())
         if area <= SIDE * SIDE:
             width = min(SIDE, max(64, 2 ** math.ceil(math.log2(math.sqrt(max(area, 1) / FILLED)))))
             places, height = _pack(sizes, width)
             if height <= SIDE and (not len(sizes) or int(sizes[:, 0].max()) <= width):
                 break
-        if texel > LARGEST_TEXEL:
+        if int(sizes.max()) <= fewest:
             raise FormatError(f"surfels: expected fewer for an atlas of {SIDE}x{SIDE} texels, got {len(sizes):,}")
-        texel *= GROWTH
+        factor *= GROWTH
     rects = torch.tensor([0, 0, 1, 1], dtype=torch.int32).repeat(len(boxes), 1)
     rects[textured.cpu()] = torch.cat([places, sizes], dim=1)
     return Layout(rects.to(boxes.device), boxes, width, height)
@@ -231,7 +236,7 @@ def evaluate(model: Model, seen: Observations, layout: Layout) -> BakedScene:
         Activated(*(x.detach() for x in surfels.activated())),
         texels,
         layout.boxes,
-        layout.ends(),
+        layout.spans(),
         (surfels.sh0.detach(), surfels.shN.detach()[:, : (options.sh_degree + 1) ** 2 - 1]),
         model.detail_limits if options.detail_limits else None,
         background=options.background,

@@ -60,7 +60,8 @@ def make_cards(model: Model, scene: BakedScene, seen: Observations, alpha: str) 
     # |u|^(2 gamma) = 2 log(opacity / alpha) at the end of the quad.
     reach = (2 * (opacities / least).clamp_min(1).log())[:, None].pow(0.5 / gammas)
     shown = opacities > (CUTOFF if alpha == "mask" else 2 * least)
-    layout = lay_out(torch.cat([-reach, reach], dim=1).where(shown[:, None], 0.0), seen.pixels, fewest=FEWEST)
+    boxes = torch.cat([-reach, reach], dim=1).where(shown[:, None], 0.0)
+    layout = lay_out(boxes, seen.pixels, seen.influence, fewest=FEWEST)
     plain = mean_colors(model, seen)
     texels = reach.new_zeros(layout.height, layout.width, 4)
     for places, ids, local in layout.centres():
@@ -73,7 +74,7 @@ def make_cards(model: Model, scene: BakedScene, seen: Observations, alpha: str) 
     ids = layout.textured()
     cut = Cut(CUTOFF) if alpha == "mask" else None
     geometry = (surfels.means[ids], surfels.quats[ids], surfels.scales[ids] * reach[ids])
-    return card_scene(geometry, texels, layout.ends()[ids], cut, exposure)
+    return card_scene(geometry, texels, layout.spans()[ids], cut, exposure)
 
 
 @torch.no_grad()

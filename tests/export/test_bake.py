@@ -36,7 +36,7 @@ def baked(model, cameras) -> BakedScene:
 
 def test_texels_have_one_owner_each_and_lie_where_sampling_looks_for_them(model, cameras):
     seen = observe(model, list(cameras.values()))
-    layout = lay_out(seen.boxes, seen.pixels)
+    layout = lay_out(seen.boxes, seen.pixels, seen.influence)
     owners = torch.zeros(layout.height, layout.width, dtype=torch.long)
     ((places, ids, local),) = layout.centres()
     owners.index_put_((places[:, 1], places[:, 0]), torch.ones(len(ids), dtype=torch.long), accumulate=True)
@@ -53,10 +53,22 @@ def test_texels_have_one_owner_each_and_lie_where_sampling_looks_for_them(model,
 
 def test_an_atlas_that_is_too_small_has_larger_texels(model, cameras, monkeypatch):
     seen = observe(model, list(cameras.values()))
-    large = lay_out(seen.boxes, 2 * seen.pixels)
+    large = lay_out(seen.boxes, 2 * seen.pixels, seen.influence)
     monkeypatch.setattr("nexwarp.export.bake.SIDE", 128)
-    small = lay_out(seen.boxes, 2 * seen.pixels)
+    small = lay_out(seen.boxes, 2 * seen.pixels, seen.influence)
     assert max(small.width, small.height) <= 128 < max(large.width, large.height)
+
+
+def test_texels_of_a_full_atlas_are_in_proportion_to_what_surfels_change_in_photos(monkeypatch):
+    monkeypatch.setattr("nexwarp.export.bake.SIDE", 512)
+    boxes, pixels = torch.tensor([-1.0, -1.0, 1.0, 1.0]).repeat(100, 1), torch.full((100, 2), 100.0)
+    influence = torch.linspace(400.0, 4000.0, 100)
+    texels = lay_out(boxes, pixels, influence).rects[:, 2:].prod(1)
+    shares = texels / influence
+    assert shares.max() / shares.min() < 1.25, "sides are whole numbers"
+    assert 0.7 * 512**2 < texels.sum() <= 512**2
+    pixels[0] = 2.0  # a few pixels in all: no more texels than these need
+    assert tuple(lay_out(boxes, pixels, influence).rects[0, 2:]) == (5, 5)
 
 
 @pytest.mark.parametrize("residual", [True, False])
@@ -65,7 +77,7 @@ def test_the_first_atlas_has_the_colors_of_the_texture(residual, cameras):
     model = small_model(1, residual=residual, sh_degree=0)
     seen = observe(model, list(cameras.values()))
     assert seen.textured[0] == 1
-    image = evaluate(model, seen, lay_out(seen.boxes, 4 * seen.pixels)).render(cameras["1.png"])
+    image = evaluate(model, seen, lay_out(seen.boxes, 4 * seen.pixels, seen.influence)).render(cameras["1.png"])
     expected = model.render(cameras["1.png"]).image.detach()
     plain = model.bare(max_hits=0).render(cameras["1.png"]).image.detach()
     assert psnr(image, expected) > max(45, psnr(plain, expected) + 10)
