@@ -20,7 +20,7 @@ from nexwarp.data.images import image_size
 from nexwarp.data.option import Flag_, option
 from nexwarp.data.scene import SceneSource, parse_color
 from nexwarp.data.transforms import lens_keys
-from nexwarp.errors import OutOfMemoryError, RunError, SettingError, check_package, require
+from nexwarp.errors import DivergedError, OutOfMemoryError, RunError, SettingError, check_package, require
 from nexwarp.export.bake import Progress
 from nexwarp.export.baked_scene import GLB, load_baked
 from nexwarp.export.fit import Views
@@ -48,6 +48,7 @@ from nexwarp.run.edit import MIDDLE, edited, subject_crop
 from nexwarp.run.evaluate import METRICS, compared, weights_file
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, METRICS_FILE, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
 from nexwarp.train.api import train
+from nexwarp.train.harden import train_hard
 from nexwarp.train.recipe import DEFAULT, MASK_MODES, MIN_SURFELS, with_settings
 from nexwarp.train.report import StepReport
 
@@ -66,7 +67,8 @@ OPTIONS = {
 Device: TypeAlias = torch.device | str
 Figures = dict[str, dict[str, float]]  # metrics on test views, of what was baked and of the model
 GREY_LEVEL = 1 / 255
-DIFFUSE_SHARE = 1 / 4  # of a run's iterations, for which its model is trained with one colour from all directions
+# Shares of a run's iterations: training with one colour from all directions (blended cards), hardening (cut-outs).
+DIFFUSE_SHARE, HARD_SHARE = 1 / 4, 1.0
 COLLISION_VOXELS = 48  # along the scene's longest side
 FAR_AROUND = 10.0  # so many times the subject, what lies around an object is left out
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows
@@ -219,7 +221,7 @@ def _export_baked(
     if order.format == "web":
         page, out = _page(opened, order), order.out or file
         return export_web(aim, views, out, seen, quality=order.quality, page=page, progress=observe)
-    model = aim if scene is None else _diffuse(opened, scene, device, observe)
+    model = aim if scene is None else _for_cards(opened, scene, device, order.alpha, observe)
     cards = bake_cards(model, seen or [*views.values()], order.alpha, aim=aim, progress=observe)
     means, quats = moved_poses(cards.shape.means, cards.shape.quats, motion)
     shape = cards.shape._replace(means=means, quats=quats, scales=cards.shape.scales * motion.scale)
@@ -274,8 +276,8 @@ def _collision(opened: OpenedModel, device: Device, observe: Progress) -> Mesh:
     return _mesh(opened, device, observe, float((high - low).max()) / COLLISION_VOXELS)
 
 
-def _diffuse(opened: OpenedModel, scene: Scene, device: Device, observe: Progress) -> Model:
-    """Continue a run's training with one colour from all directions, as cards have it; no surfel is added.
+def _for_cards(opened: OpenedModel, scene: Scene, device: Device, alpha: str, observe: Progress) -> Model:
+    """Train a run on for cards: with one colour from all directions; for cut-outs, also hardened.
 
     Returns the model unchanged where it is cropped, as the photos then have no loss around its edge, and where its
     texture cannot be baked. Warns and returns it unchanged where training fails.
@@ -283,20 +285,26 @@ def _diffuse(opened: OpenedModel, scene: Scene, device: Device, observe: Progres
     before, config = opened.model, opened.config or DEFAULT
     if _is_cropped(opened) or type(before.texture) is not NeuralTexture:
         return before.to(device)
-    iterations = max(round(DIFFUSE_SHARE * config.iterations), 1)
+    hard = alpha == "mask"
+    iterations = max(round((HARD_SHARE if hard else DIFFUSE_SHARE) * config.iterations), 1)
     settings: dict[str, object] = dict.fromkeys(("sh_degree", "teachers", "smooth_sh"), 0)
-    settings |= {"densify.fraction": 0.0, "densify.relocate": 0.0, "refine_poses": False, "mask_mode": MASK_MODES[0]}
+    if not hard:
+        settings |= {"densify.fraction": 0.0, "densify.relocate": 0.0}
     settings |= {"exposures": before.exposures is not None, "max_surfels": max(len(before.surfels), MIN_SURFELS)}
     settings |= {"background": before.options.background, "iterations": iterations, "steps_a_photo": None}
-    config = with_settings(config, settings)
+    config = with_settings(config, settings | {"refine_poses": False, "mask_mode": MASK_MODES[0]})
+    stage = "training opaque surfels" if hard else "training with one colour from all directions"
 
     def report(step: StepReport) -> None:
-        observe("training with one colour from all directions", step.iteration, iterations)
+        observe(stage, step.iteration, iterations)
 
     try:
-        model = train(scene, config, device=device, init=before, callbacks=[report])
-    except (ValueError, OutOfMemoryError) as error:
-        why = f"the model is not trained with one colour from all directions ({one_line(error)})"
+        if hard:
+            model = train_hard(scene, config, device, before, report)
+        else:
+            model = train(scene, config, device=device, init=before, callbacks=[report])
+    except (ValueError, DivergedError, OutOfMemoryError) as error:
+        why = f"the model is not trained for cards ({one_line(error)})"
         warnings.warn(f"{why}; --no-finetune leaves that out", stacklevel=2)
         return before.to(device)
     model.exposures = None if before.exposures is None else before.exposures.to(device)

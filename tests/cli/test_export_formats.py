@@ -12,9 +12,11 @@ import nexwarp as nw
 from nexwarp.cli import main as cli
 from nexwarp.data.ply import read_vertices
 from nexwarp.export import baked_scene
+from nexwarp.export.bake import measure
 from nexwarp.export.baked_scene import load_baked
+from nexwarp.export.glb import make_cards
 from nexwarp.run.evaluate import psnr
-from nexwarp.run.export import ExportOrder, _diffuse, _photos, export_run
+from nexwarp.run.export import ExportOrder, _for_cards, _photos, export_run
 from nexwarp.run.folder import open_model, read_metrics
 from tests.cli.support import read, refused
 from tests.narrowing import present
@@ -141,7 +143,7 @@ def test_cards_come_from_a_model_with_one_colour_from_all_directions(finished, m
     monkeypatch.setattr("nexwarp.run.export.DIFFUSE_SHARE", 3)
     opened, calls = open_model(finished), list[tuple[str, int, int]]()
     photos = present(_photos(opened, "cpu", lambda *_: None))
-    model = _diffuse(opened, photos, "cpu", lambda *call: calls.append(call))
+    model = _for_cards(opened, photos, "cpu", "blend", lambda *call: calls.append(call))
     assert model.surfels.shN.shape[1] == 0 and present(model.texture).sh_degree == model.options.sh_degree == 0
     assert len(model.surfels) <= len(opened.model.surfels) and calls[-1][1] == calls[-1][2] == len(calls)
 
@@ -151,9 +153,29 @@ def test_cards_come_from_a_model_with_one_colour_from_all_directions(finished, m
 
     assert quality(model) > quality(opened.model) + 0.5
     assert model.options.background == opened.model.options.background
-    with pytest.warns(UserWarning, match="not trained with one colour .* whose scale"):
-        same = _diffuse(opened, dataclasses.replace(photos, scale=2 * photos.scale), "cpu", lambda *_: None)
-    assert same is opened.model
+    with pytest.warns(UserWarning, match="not trained for cards .* whose scale"):
+        other = dataclasses.replace(photos, scale=2 * photos.scale)
+        assert _for_cards(opened, other, "cpu", "blend", lambda *_: None) is opened.model
+
+
+def test_cut_outs_of_a_hardened_model_show_what_it_shows(finished, monkeypatch):
+    monkeypatch.setattr("nexwarp.run.export.HARD_SHARE", 20)
+    opened = open_model(finished)
+    photos = present(_photos(opened, "cpu", lambda *_: None))
+    hard = _for_cards(opened, photos, "cpu", "mask", lambda *_: None)
+    assert hard.surfels.gammas.min() > 2.9
+
+    def opaque(model: nw.Model) -> float:
+        opacities = model.surfels.opacities
+        return ((opacities < 0.1) | (opacities > 0.9)).float().mean().item()
+
+    def kept(model: nw.Model) -> float:
+        cards = make_cards(model, *measure(model, photos.train), "mask")
+        pairs = [(cards.render(view.camera), model.render_image(view.camera, exposure="mean")) for view in photos.train]
+        return np.mean([psnr(*pair) for pair in pairs]).item()
+
+    assert opaque(hard) > 0.8 > opaque(opened.model) + 0.3
+    assert kept(hard) > kept(opened.model) + 3
 
 
 @pytest.mark.parametrize(
