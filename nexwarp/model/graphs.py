@@ -306,7 +306,7 @@ class CapturedRendering(Rendering):
                 return
             # On the stream of its image, whichever thread it is that needs the graph's memory.
             with frame.graphs.using(self.__dict__["stream"]), torch.inference_mode(False), torch.no_grad():
-                copies: dict[int, torch.Tensor] = {}
+                copies: dict[tuple[object, ...], torch.Tensor] = {}
                 for name in _COPIED:
                     self.__dict__[name] = _copied(getattr(frame.result, name), copies)
             self.__dict__["frame"] = None
@@ -315,12 +315,13 @@ class CapturedRendering(Rendering):
         return Rendering, tuple(getattr(self, field.name) for field in dataclasses.fields(Rendering))
 
 
-def _copied(value: object, copies: dict[int, torch.Tensor]) -> object:
-    """Copy a tensor, or a dataclass with all tensors in it; a tensor that occurs twice is copied once."""
+def _copied(value: object, copies: dict[tuple[object, ...], torch.Tensor]) -> object:
+    """Copy a tensor, or a dataclass with all tensors in it; tensors that are the same view of memory get one copy."""
     if isinstance(value, torch.Tensor):
-        if id(value) not in copies:
-            copies[id(value)] = value.clone()
-        return copies[id(value)]
+        memory = value.data_ptr(), value.shape, value.stride(), value.dtype
+        if memory not in copies:
+            copies[memory] = value.clone()
+        return copies[memory]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
         return dataclasses.replace(value, **{name: _copied(part, copies) for name, part in fields.items()})

@@ -1,7 +1,6 @@
 """Collection pass (paper Sec. 4.2): each pixel's K heaviest hits, their plain colour, and that of all other hits."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -43,7 +42,8 @@ class SplatErrorRequest:
     sums_after_backward: torch.Tensor | None = None
 
 
-class Walked(NamedTuple):
+@dataclass(frozen=True)
+class Walked:
     """What a walk along rays reads: records (N, 4, 4) and limits (N,) of the surfels, their lists, the image plane.
 
     `channels` (N, 4, 4) are more channels of their colours, or None.

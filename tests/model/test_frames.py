@@ -1,4 +1,5 @@
 import copy
+import dataclasses
 import gc
 import threading
 import weakref
@@ -54,6 +55,21 @@ def test_a_staged_camera_renders_what_its_camera_does(device: torch.device) -> N
         present(staged.falloff).copy_(present(exposures.falloff_of(camera)))
         found, expected = (draw(model._frame(c, None, {})) for c in (staged, camera))
         assert_same(found, expected, (*BUFFERS, "ids", "colors"))
+
+
+def test_a_copy_of_a_frame_shares_no_memory_with_it() -> None:
+    """On CUDA the next frame overwrites what a graph has written."""
+
+    def memory(value: object) -> set[int]:
+        if isinstance(value, torch.Tensor):
+            return {value.untyped_storage().data_ptr()} if value.numel() else set()
+        parts = vars(value).values() if dataclasses.is_dataclass(value) else value if isinstance(value, tuple) else ()
+        return set().union(*map(memory, parts))
+
+    with torch.no_grad():
+        stages = finished("cpu").render(cameras("cpu")[0]).intermediates
+    copied = memory(frames._copied(stages, {}))
+    assert len(copied) > 10 and not copied & memory(stages)
 
 
 @CUDA
