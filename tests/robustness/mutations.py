@@ -100,7 +100,7 @@ MUTATIONS = [
     Mutation(PAGE + "baked_shaders.js", "x.z - 2.0 * near", "x.z", BAKED),
     Mutation(PAGE + "baked_shaders.js", "color * alpha, alpha", "color, alpha", BAKED),
     # 64: files, locks, judgement
-    Mutation("io/files.py", "            sync(temporary)\n", "            pass\n", "tests/robustness/test_power_cut.py -k loses"),
+    Mutation("io/files.py", "sync(temporary)\n            os.replace", "pass\n            os.replace", "tests/robustness/test_power_cut.py -k loses"),
     Mutation("io/files.py", "os.replace(temporary, path)", "path.write_bytes(temporary.read_bytes())", "tests/robustness/test_faults.py -k 'eval or cameras'"),
     Mutation("io/ply.py", 'newbyteorder("<")', 'newbyteorder(">")', "tests/export/test_export.py"),
     Mutation("model/compact.py", "root = vectors * values", "root = vectors / values", "tests/model/test_compact_files.py"),

@@ -67,7 +67,7 @@ def test_a_rendering_or_gradient_that_lacks_memory_can_be_repeated(device):
             failed += 1
         for again in (found or expected, results()):
             assert all(torch.equal(a, b) for a, b in zip(again, expected, strict=True)), fatal
-    assert failed == len(all_fatal) if device.type == "cpu" else failed > 0.5 * len(all_fatal)
+    assert failed == len(all_fatal) if device.type == "cpu" else failed > 0.2 * len(all_fatal)
 
 
 def test_a_training_that_lacks_memory_goes_on_from_a_snapshot(tiny_scene, device):
