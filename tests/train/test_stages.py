@@ -22,7 +22,7 @@ from nexwarp.train.checkpoint import CHECKPOINTS, has_checkpoint
 from nexwarp.train.ranks.ranks import Ranks
 from nexwarp.train.recipe import TextureConfig
 from nexwarp.train.stages import VIEW_COST, OwnTeachers, StageRunner, divide, plan_teachers, shortened
-from tests.cli.support import snapshot
+from tests.cli.support import refused, snapshot
 
 CPU = torch.device("cpu")
 CONFIG = nw.Config(
@@ -128,19 +128,21 @@ def test_train_is_a_training_for_each_stage(tiny_scene: nw.Scene, tmp_path: Path
 
 
 @pytest.fixture(scope="module")
-def command(tiny_folder: Path) -> Callable[..., int]:
-    def train(run: Path, *options: str, iterations: int = 20) -> int:
+def command(tiny_folder: Path) -> Callable[..., list[str]]:
+    """What makes the command of a training with two teachers."""
+
+    def train(run: Path, *options: str, iterations: int = 20) -> list[str]:
         asked = ["--iterations", str(iterations), "--set", "teachers=2", *SMALL, *options]
-        return cli.main(["train", str(tiny_folder), "--run", str(run), *asked])
+        return ["train", str(tiny_folder), "--run", str(run), *asked]
 
     return train
 
 
 @pytest.fixture(scope="module")
-def finished(command: Callable[..., int], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def finished(command: Callable[..., list[str]], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with two teachers of 4 iterations and a student of 12; not to be changed."""
     run = tmp_path_factory.mktemp("runs") / "whole"
-    assert command(run) == 0
+    assert cli.main(command(run)) == 0
     return run
 
 
@@ -210,7 +212,7 @@ def test_a_run_resumes_in_each_stage(run, finished, command, capsys, lost):
             (run / "teachers" / str(number) / "metrics.json").unlink()
     before = [(run / "teachers" / str(number) / "model.safetensors").stat().st_mtime_ns for number in range(1, first)]
     capsys.readouterr()
-    assert command(run, "--resume") == 0
+    assert cli.main(command(run, "--resume")) == 0
     assert model_of(run) == model_of(finished)
     told = capsys.readouterr().out
     for number in (1, 2):
@@ -222,34 +224,28 @@ def test_a_run_resumes_in_each_stage(run, finished, command, capsys, lost):
 
 @pytest.mark.parametrize("stop", [6, 15])
 def test_a_stopped_run_goes_on_where_it_was(finished, command, tmp_path, monkeypatch, stop):
-    steps: list[None] = []
+    """Interrupted after some of its 20 steps, it takes only the others."""
+    step, run = nw.Trainer.step, tmp_path / "run"
     taken: list[None] = []
-    step = nw.Trainer.step
-
-    def killed(trainer: nw.Trainer) -> nw.StepReport:
-        steps.append(None)
-        if len(steps) > stop:
-            raise KeyboardInterrupt
-        return step(trainer)
-
-    run = tmp_path / "run"
-    with monkeypatch.context() as patched:
-        patched.setattr(nw.Trainer, "step", killed)
-        assert command(run, "--checkpoint-every", "1") == 130
-    assert not (run / "model.safetensors").exists()
+    stops = [stop]
 
     def counted(trainer: nw.Trainer) -> nw.StepReport:
+        if len(taken) in stops:
+            raise KeyboardInterrupt
         taken.append(None)
         return step(trainer)
 
     monkeypatch.setattr(nw.Trainer, "step", counted)
-    assert command(run, "--resume") == 0
-    assert len(taken) == 20 - stop and model_of(run) == model_of(finished)
+    assert cli.main(command(run, "--checkpoint-every", "1")) == 130
+    assert len(taken) == stop and not (run / "model.safetensors").exists()
+    stops.clear()
+    assert cli.main(command(run, "--resume")) == 0
+    assert len(taken) == 20 and model_of(run) == model_of(finished)
 
 
-def test_a_longer_run_keeps_its_teachers(run: Path, command: Callable[..., int], tiny_scene: nw.Scene) -> None:
+def test_a_longer_run_keeps_its_teachers(run: Path, command: Callable[..., list[str]]) -> None:
     teachers = [(run / "teachers" / name / "model.safetensors").read_bytes() for name in "12"]
-    assert command(run, "--resume", iterations=30) == 0
+    assert cli.main(command(run, "--resume", iterations=30)) == 0
     assert json.loads((run / "metrics.json").read_text())["iterations"] == 30
     assert [(run / "teachers" / name / "model.safetensors").read_bytes() for name in "12"] == teachers
     assert read_run(run).config.iterations == 30 and dataclasses.asdict(read_run(run).own) == OWN
@@ -260,8 +256,7 @@ def test_overwriting_deletes_teachers_and_keeps_what_is_not_ours(run, command, c
         (run / name).parent.mkdir(exist_ok=True)
         (run / name).write_text("mine")
     assert sorted(list_files(run)[1]) == ["teachers/1/notes.txt", "teachers/9/model.safetensors", "teachers/mine.txt"]
-    assert command(run, "--overwrite", "--set", "teachers=0") == 2  # twice the same setting
-    capsys.readouterr()
+    refused(capsys, command(run, "--overwrite", "--set", "teachers=0"), "teachers: expected it once")
     asked = ["--run", str(run), "--iterations", "5", *SMALL, "--overwrite"]
     assert cli.main(["train", read_run(run).source.path, *asked]) == 0
     left = {file.relative_to(run).as_posix() for file in (run / "teachers").rglob("*") if file.is_file()}
@@ -275,22 +270,19 @@ def test_what_is_not_the_runs_is_not_taken_for_a_teacher(run, command, tmp_path,
     place.rename(tmp_path / "elsewhere")
     place.symlink_to(tmp_path / "elsewhere") if kind == "link" else place.write_text("mine")
     before = snapshot(tmp_path)
-    assert command(run, "--overwrite") == 2
-    told = capsys.readouterr().err
-    assert f"{place}: expected a teacher's folder or nothing, got what nexwarp did not write" in told
+    message = f"{place}: expected a teacher's folder or nothing, got what nexwarp did not write"
+    refused(capsys, command(run, "--overwrite"), message)
     assert snapshot(tmp_path) == before
 
 
 def test_a_run_that_lost_a_teacher_says_so_before_it_trains(run, finished, command, capsys):
     shutil.rmtree(run / "teachers" / "2")
-    assert command(run, "--resume", iterations=30) == 2
-    told = capsys.readouterr().err
-    assert f"{run}/teachers/2: expected the complete teacher that the student in {run} has learned from" in told
+    message = f"{run}/teachers/2: expected the complete teacher that the student in {run} has learned from"
+    refused(capsys, command(run, "--resume", iterations=30), message)
     assert read_run(run).config.iterations == 20 and not (run / "teachers" / "2").exists()
     shutil.copytree(finished / "teachers" / "1", run / "teachers" / "2")
-    assert command(run, "--resume") == 2
-    told = capsys.readouterr().err
-    assert f"{run}/teachers/2: expected a teacher with the settings of {run}, got others" in told
+    message = f"{run}/teachers/2: expected a teacher with the settings of {run}, got others"
+    refused(capsys, command(run, "--resume"), message)
 
 
 def test_memory_that_a_teacher_lacks_is_told_as_its_own(command, tmp_path, monkeypatch, capsys):
@@ -300,10 +292,9 @@ def test_memory_that_a_teacher_lacks_is_told_as_its_own(command, tmp_path, monke
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.50 GiB. And more")
 
     monkeypatch.setattr(trainer_module, "draw", fail)
-    assert command(tmp_path / "run") == 2
-    told = capsys.readouterr().err.removeprefix("nexwarp: error: ").strip()
-    assert told.startswith("teacher 1 of 2: out of memory at iteration 1: it needed 2.50 GiB")
-    assert "--max-surfels (now 240)" in told and told.endswith(", or do without teachers (--set teachers=0)")
+    begin = "nexwarp: error: teacher 1 of 2: out of memory at iteration 1: it needed 2.50 GiB"
+    end = ", or do without teachers (--set teachers=0)\n"
+    refused(capsys, command(tmp_path / "run"), begin, "--max-surfels (now 240)", end)
 
 
 def test_a_record_with_invalid_teachers_is_refused(tmp_path: Path) -> None:
