@@ -10,11 +10,6 @@ POINTS = RNG.normal(size=(40, 3))
 COLORS = RNG.integers(0, 256, (40, 3))
 
 
-def positions_and_colors(path):
-    cloud = read_ply(path)
-    return cloud.positions, cloud.colors
-
-
 def ply(elements: str, body: bytes, form: str = "binary_little_endian") -> bytes:
     return f"ply\nformat {form} 1.0\ncomment made by hand\n{elements}end_header\n".encode() + body
 
@@ -39,9 +34,10 @@ def test_properties_in_any_order_and_of_any_kind(tmp_path, order):
     header = vertex(40, *(f"{names[kind]} {name}" for name, kind in fields))
     header += "element face 2\nproperty list uchar int vertex_indices\n"
     (tmp_path / "a.ply").write_bytes(ply(header, data.tobytes() + b"\3" + 12 * b"\0" + b"\0", form))
-    points, colors = positions_and_colors(tmp_path / "a.ply")
-    assert np.array_equal(points, np.stack([data[axis].astype(float) for axis in "xyz"], axis=1))
-    assert points.dtype == np.float64 and colors.dtype == np.uint8 and np.array_equal(colors, COLORS)
+    cloud = read_ply(tmp_path / "a.ply")
+    assert np.array_equal(cloud.positions, np.stack([data[axis].astype(float) for axis in "xyz"], axis=1))
+    assert cloud.positions.dtype == np.float64
+    assert cloud.colors.dtype == np.uint8 and np.array_equal(cloud.colors, COLORS)
 
 
 def test_ascii_after_another_element(tmp_path):
@@ -49,15 +45,15 @@ def test_ascii_after_another_element(tmp_path):
     text = "".join(f"{x!r} {y!r} {z!r} {r} {g} {b}\r\n" for (x, y, z), (r, g, b) in rows)
     header = "element camera 2\nproperty float f\n" + vertex(40, "double x", "double y", "double z", *RGB)
     (tmp_path / "a.ply").write_bytes(ply(header, b"1\n2\n" + text.encode() + b"extra\n", "ascii"))
-    points, colors = positions_and_colors(tmp_path / "a.ply")
-    assert np.array_equal(points, POINTS) and np.array_equal(colors, COLORS)
+    cloud = read_ply(tmp_path / "a.ply")
+    assert np.array_equal(cloud.positions, POINTS) and np.array_equal(cloud.colors, COLORS)
 
 
 def test_binary_after_another_element(tmp_path):
     header = "element camera 2\nproperty float f\nproperty uchar g\n" + vertex(1, *XYZ)
     (tmp_path / "a.ply").write_bytes(ply(header, 10 * b"\7" + struct.pack("<3f", 1, 2, 3)))
-    points, colors = positions_and_colors(tmp_path / "a.ply")
-    assert points.tolist() == [[1, 2, 3]] and colors.tolist() == [[128, 128, 128]]
+    cloud = read_ply(tmp_path / "a.ply")
+    assert cloud.positions.tolist() == [[1, 2, 3]] and cloud.colors.tolist() == [[128, 128, 128]]
 
 
 @pytest.mark.parametrize(

@@ -14,12 +14,13 @@ from nexwarp.run.evaluate import evaluate
 from nexwarp.train import exposure as exposure_calibration
 from nexwarp.train.exposure import Observations, calibrate_exposures, choose_fit, fit_exposures, observations
 from nexwarp.train.losses import as_taken, photo_losses
-from nexwarp.train.recipe import Config, LossWeights, TextureConfig
+from nexwarp.train.recipe import Config, LossWeights
 from nexwarp.train.target import Target, mean_color
 from tests.narrowing import present
 from tests.scene_writers import exposure_at, with_exposures, write_demo
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
+from tests.trainer_support import small, trained
 
 K = torch.tensor([[60.0, 0.0, 32.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]])
 
@@ -266,30 +267,21 @@ def test_the_mean_colour_is_that_of_the_mean_exposure():
     assert mean_color(views, calibration) == pytest.approx(scene.mean((0, 1)).tolist(), abs=2e-3)
 
 
-def trained(scene: nw.Scene, **changes: Any) -> tuple[nw.Model, float]:
-    """A small training with some settings changed, and the PSNR of its test views."""
-    texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
-    trainer = nw.Trainer(scene, Config(iterations=150, max_surfels=400, texture=texture, **changes), "cpu")
-    trainer.run()
-    model = trainer.finish()
-    return model, evaluate(model, scene.test)["psnr"]
-
-
 def test_training_takes_exposures_out(tmp_path):
     """Photos that grow brighter along the capture, on which a model of one exposure cannot show."""
     scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=56, height=42, views=24, points=1500)))
     expected = torch.tensor([exposure_at(view) for view in scene.train]).log()
     expected -= expected.mean()
-    _, without = trained(scene, exposures=False)
-    model, figure = trained(scene, exposures=True)
-    assert (present(model.exposures).log_gains - expected[:, None]).abs().max() < 0.03 and figure > without + 0.5
+    configs = (small(iterations=150, max_surfels=400, exposures=exposed) for exposed in (True, False))
+    model, without = (trained(scene, config).finish() for config in configs)
+    assert (present(model.exposures).log_gains - expected[:, None]).abs().max() < 0.03
+    assert evaluate(model, scene.test)["psnr"] > evaluate(without, scene.test)["psnr"] + 0.5
 
 
 @pytest.mark.parametrize("change", [{"exposures": False}, {"mask_mode": "background"}])
 def test_no_exposures_where_none_are_wanted(tmp_path, change):
     scene = with_exposures(nw.load_scene(write_demo(tmp_path / "demo", width=24, height=18, views=6, points=60)))
-    texture = TextureConfig(levels=2, table_size=2**6, width=16, hidden_layers=1)
-    config = Config(iterations=2, max_surfels=40, texture=texture, **change)
+    config = small(iterations=2, max_surfels=40, **change)
     assert nw.Trainer(scene, config, "cpu").finish().exposures is None
     # A background that is known is no photo's business.
     known = dataclasses.replace(scene, background=(1.0, 1.0, 1.0))

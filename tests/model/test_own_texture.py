@@ -13,6 +13,8 @@ from nexwarp.train.recipe import DensifyConfig
 from tests.scenes import make_camera, make_surfels, make_texture, random_scene
 from tests.trainer_support import assert_resumed_alike, small
 
+CONFIG = small(iterations=40, max_surfels=200, densify=DensifyConfig(start=5, stop=29_000, every=5, fraction=0.3))
+
 
 class Wrapped(nw.Texture):
     """A neural texture behind the protocol."""
@@ -94,14 +96,9 @@ def test_a_file_keeps_what_is_registered_and_refuses_the_rest(tmp_path: Path) ->
         nw.register_texture(nw.NeuralTexture)
 
 
-@pytest.fixture(scope="module")
-def config() -> nw.Config:
-    return small(iterations=40, max_surfels=200, densify=DensifyConfig(start=5, stop=29_000, every=5, fraction=0.3))
-
-
-def test_training_moves_parameters_and_rows(tiny_scene: Scene, config: nw.Config, tmp_path: Path) -> None:
+def test_training_moves_parameters_and_rows(tiny_scene: Scene, tmp_path: Path) -> None:
     reports: list[nw.StepReport] = []
-    model = nw.train(tiny_scene, config, device="cpu", texture=painted, callbacks=[reports.append])
+    model = nw.train(tiny_scene, CONFIG, device="cpu", texture=painted, callbacks=[reports.append])
     texture = model.texture
     assert isinstance(texture, Painted)
     assert len(texture.grid) == len(model.surfels) == 200 > reports[0].surfels and texture.grid.any()
@@ -113,20 +110,20 @@ def test_training_moves_parameters_and_rows(tiny_scene: Scene, config: nw.Config
     assert torch.equal(again.render(camera).image, model.render(camera).image)
 
 
-def test_a_checkpoint_holds_it(tiny_scene: Scene, config: nw.Config, tmp_path: Path) -> None:
+def test_a_checkpoint_holds_it(tiny_scene: Scene, tmp_path: Path) -> None:
     """Resumed, also where the rows are no longer those of the start, it ends with the same bits."""
-    straight = nw.Trainer(tiny_scene, config, "cpu", texture=painted)
+    straight = nw.Trainer(tiny_scene, CONFIG, "cpu", texture=painted)
     assert straight.optimizer.param_groups[-1]["name"] == "texture"
     rows = len(straight.surfels)
     straight.run()
     assert len(straight.surfels) > rows
     assert_resumed_alike(straight, tmp_path, 20, texture=painted)
     with pytest.raises(ValueError, match="scene's photos"):
-        nw.Trainer(tiny_scene, config, "cpu").restore(tmp_path)
+        nw.Trainer(tiny_scene, CONFIG, "cpu").restore(tmp_path)
 
 
-def test_what_does_not_fit_is_refused(tiny_scene: Scene, config: nw.Config) -> None:
-    trainer = nw.Trainer(tiny_scene, config, "cpu")
+def test_what_does_not_fit_is_refused(tiny_scene: Scene) -> None:
+    trainer = nw.Trainer(tiny_scene, CONFIG, "cpu")
     for name in ("texture", "surfels"):
         with pytest.raises(AttributeError):
             setattr(trainer, name, getattr(trainer, name))
@@ -139,4 +136,4 @@ def test_what_does_not_fit_is_refused(tiny_scene: Scene, config: nw.Config) -> N
     ]
     for texture, changes, message in wrong:
         with pytest.raises((TypeError, ValueError), match=message):
-            nw.train(tiny_scene, dataclasses.replace(config, **changes), device="cpu", texture=texture)
+            nw.train(tiny_scene, dataclasses.replace(CONFIG, **changes), device="cpu", texture=texture)

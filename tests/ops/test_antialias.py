@@ -18,6 +18,7 @@ def antialiased(depths, scales, opacities, gammas, farthest, focal):
 
 
 def arguments(count: int, dtype: torch.dtype, device: torch.device) -> tuple[Shape, torch.Tensor]:
+    """Of `ops.antialias`; those of the shape want gradients."""
     generator = torch.Generator().manual_seed(5)
     shapes = ((count,), (count, 2), (count,), (count, 2), (count,))
     depths, scales, opacities, gammas, farthest = (
@@ -25,15 +26,14 @@ def arguments(count: int, dtype: torch.dtype, device: torch.device) -> tuple[Sha
     )
     # Pixels of 0.006 to 0.05 units, a few behind the camera.
     values = [5 * depths - 0.4, 0.001 + 0.1 * scales, opacities, 1 + 9 * gammas, 0.002 + 0.03 * farthest]
-    depths, scales, opacities, gammas, farthest = (x.to(dtype=dtype, device=device) for x in values)
-    return (depths, scales, opacities, gammas), farthest
+    *shape, farthest = (x.to(dtype=dtype, device=device).requires_grad_() for x in values)
+    depths, scales, opacities, gammas = shape
+    return (depths, scales, opacities, gammas), farthest.detach()
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_widening_is_what_torch_gives(dtype: torch.dtype, device: torch.device) -> None:
     shape, farthest = arguments(500, dtype, device)
-    for x in shape:
-        x.requires_grad_()
     signals = [torch.randn(x.shape, generator=torch.Generator().manual_seed(1), dtype=dtype).to(x) for x in shape[1:]]
     found, expected = ops.antialias(*shape, farthest, 90.0), antialiased(*shape, farthest, 90.0)
     far = shape[0].detach() / 90.0 > farthest
@@ -55,8 +55,6 @@ def test_widening_of_extremes_is_finite(device: torch.device) -> None:
         shape[1][:, 1] = shape[1][:, 0]
         shape[3][:, 1] = torch.tensor([1e30, 1e10, 1.0, 1.0, 1e3, 1.0, 1.0, 1.0])
         farthest.copy_(torch.tensor([0.0] * 7 + [NEVER]))
-    for x in shape:
-        x.requires_grad_()
     found = ops.antialias(*shape, farthest, 1.0)
     for name, values, given in zip(("scales", "opacities", "gammas"), found, shape[1:], strict=True):
         assert_finite(values, name)

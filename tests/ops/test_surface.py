@@ -1,5 +1,3 @@
-from typing import Any
-
 import pytest
 import torch
 
@@ -7,7 +5,7 @@ import nexwarp as nw
 from tests.narrowing import present
 from tests.reference.collect import Shape
 from tests.reference.surface import Surface, surface
-from tests.render_support import assert_gradients, loss, rigid_gradient, twin, view_of
+from tests.render_support import assert_gradients, draw, loss, rigid_gradient, twin, view_of
 from tests.scenes import Scene, facing_scene, make_camera, make_surfels, make_texture, named_scene, random_scene
 from tests.tolerances import FLIPS, assert_close
 
@@ -15,10 +13,6 @@ DEPTHS = ("expected_depth", "median_depth", "top_depth")
 BUFFERS = (*DEPTHS, "normals", "blended_normals")
 MAX_HITS = 8
 GEOMETRY = ("means", "quats", "scales", "opacities", "gammas")
-
-
-def draw(scene: Scene, **options: Any) -> nw.Rendering:
-    return nw.render(make_surfels(scene), None, make_camera(scene), **options)
 
 
 def facing_quads(*quads: tuple[float, float], device: torch.device, turned: bool = False) -> Scene:

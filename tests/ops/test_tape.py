@@ -7,7 +7,7 @@ from nexwarp import ops
 from nexwarp.model.surfels import PARAMETERS
 from nexwarp.ops import tape as passes
 from tests.narrowing import present
-from tests.scenes import CAMERA_KEYS, SURFEL_KEYS, make_surfels, make_texture, random_scene
+from tests.scenes import SURFEL_KEYS, make_camera, make_surfels, make_texture, random_scene
 from tests.tolerances import assert_close
 from tests.warp_kernels import REAL, weighted_sum
 
@@ -19,10 +19,9 @@ def test_tape_and_torch_give_the_same_gradients_of_a_nexel(device: torch.device)
     scene = random_scene(dtype=torch.float64, device=device, off_centre=True)
     surfels, texture = make_surfels(scene), make_texture(dtype=torch.float64, device=device)
     texture.half_precision = False
-    viewmat = scene["viewmat"].clone().requires_grad_()
-    camera = nw.Camera(**{key: scene[key] for key in CAMERA_KEYS} | {"viewmat": viewmat})
+    camera = make_camera(scene)
     x = example.parameters_of(surfels, texture)
-    view, resolutions = example.array(viewmat[None], 2), example.array(texture.resolutions.double())
+    view, resolutions = example.array(camera.viewmat[None], 2), example.array(texture.resolutions.double())
     tape, loss = wp.Tape(), wp.zeros(1, dtype=REAL, device=view.device, requires_grad=True)
     image = example.draw(tape, x, resolutions, camera, view)
     weights = torch.randn(camera.height, camera.width, 3, dtype=torch.float64).to(device)
@@ -40,7 +39,7 @@ def test_tape_and_torch_give_the_same_gradients_of_a_nexel(device: torch.device)
     for name, parameter in parameters.items():
         assert present(parameter.grad).abs().max() > 0, name
         assert_close(wp.to_torch(x[name].grad), present(parameter.grad), kind="gradient", name=name)
-    assert_close(wp.to_torch(view.grad)[0], present(viewmat.grad), kind="gradient", name="viewmat")
+    assert_close(wp.to_torch(view.grad)[0], present(camera.viewmat.grad), kind="gradient", name="viewmat")
 
 
 def test_residual_colors_are_composed_with_the_plain_ones(device: torch.device) -> None:
@@ -63,15 +62,14 @@ def test_residual_colors_are_composed_with_the_plain_ones(device: torch.device) 
 def test_tape_and_torch_give_the_same_gradients_of_a_surface(device: torch.device) -> None:
     scene = random_scene(dtype=torch.float64, device=device, off_centre=True)
     leaves = {key: scene[key].clone().requires_grad_() for key in SURFEL_KEYS[:5]}
-    viewmat = scene["viewmat"].clone().requires_grad_()
-    camera = nw.Camera(**{key: scene[key] for key in CAMERA_KEYS} | {"viewmat": viewmat})
+    camera = make_camera(scene)
     pinhole = ops.Pinhole(camera.K, camera.width, camera.height, camera.near)
     means, quats, scales, opacities, gammas = leaves.values()
     given = (means, quats, scales, opacities, gammas)
-    projection = ops.project(*given, torch.zeros_like(means), viewmat)
-    tiles = ops.intersect_tiles(given, projection, viewmat, pinhole)
-    found = ops.surface(projection, ops.collect(projection, tiles, pinhole), viewmat.detach())
-    normals = found.blended_normals @ viewmat[:3, :3].detach().T  # back to the camera's frame
+    projection = ops.project(*given, torch.zeros_like(means), camera.viewmat)
+    tiles = ops.intersect_tiles(given, projection, camera.viewmat, pinhole)
+    found = ops.surface(projection, ops.collect(projection, tiles, pinhole), camera.viewmat.detach())
+    normals = found.blended_normals @ camera.viewmat[:3, :3].detach().T  # back to the camera's frame
     buffers = [found.expected_depth, found.median_depth, found.top_depth, normals]
     cotangents = [torch.randn_like(x) for x in buffers]
     torch.autograd.backward(buffers, cotangents)
@@ -79,7 +77,7 @@ def test_tape_and_torch_give_the_same_gradients_of_a_surface(device: torch.devic
     tape = wp.Tape()
     shape = [example.array(x, x.ndim - 1) for x in given]
     m, q, s, o, g = shape
-    view, colors = example.array(viewmat[None], 2), example.array(torch.zeros_like(scene["means"]), 1)
+    view, colors = example.array(camera.viewmat[None], 2), example.array(torch.zeros_like(scene["means"]), 1)
     image = passes.Image((camera.fx, camera.fy, camera.cx, camera.cy), (camera.width, camera.height), camera.near)
     records, centers, limits = passes.project(tape, m, q, s, o, g, colors, view)
     lists = passes.intersect_tiles(m, q, s, o, g, centers, view, image)
@@ -91,4 +89,4 @@ def test_tape_and_torch_give_the_same_gradients_of_a_surface(device: torch.devic
     tape.backward(grads=grads)
     for array, (name, leaf) in zip(shape, leaves.items(), strict=True):
         assert_close(wp.to_torch(array.grad), present(leaf.grad), kind="gradient", name=name)
-    assert_close(wp.to_torch(view.grad)[0], present(viewmat.grad), kind="gradient", name="viewmat")
+    assert_close(wp.to_torch(view.grad)[0], present(camera.viewmat.grad), kind="gradient", name="viewmat")

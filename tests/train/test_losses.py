@@ -15,21 +15,17 @@ from tests.reference import losses as reference
 from tests.tolerances import assert_close
 
 
-def images(height: int = 13, width: int = 17, dtype: torch.dtype = torch.float64) -> list[torch.Tensor]:
-    """Two similar images, apart by more than a finite difference step in every pixel."""
-    target = torch.rand(height, width, 3, dtype=torch.float64)
-    offset = (torch.randint(2, target.shape) * 2 - 1) * (0.05 + 0.2 * torch.rand_like(target))
-    return [(target + offset).to(dtype), target.to(dtype)]
-
-
-def arguments(slots: int = 2) -> dict[str, Any]:
-    image, target = images()
+def arguments(slots: int = 2) -> dict[str, torch.Tensor]:
+    """Inputs of `photo_losses`, leaves but for the target, which is apart from the image in every pixel."""
+    target = torch.rand(13, 17, 3, dtype=torch.float64)
+    image = target + (torch.randint(2, target.shape) * 2 - 1) * (0.05 + 0.2 * torch.rand_like(target))
     weights = 0.4 * torch.rand(13, 17, slots, dtype=torch.float64)
-    textured = 0.5 * weights.sum(-1, keepdim=True).expand(-1, -1, 3)
-    return {"image": image, "textured": textured, "weights": weights, "target": target}
+    textured = 0.5 * weights.sum(-1, keepdim=True).repeat(1, 1, 3)
+    leaves = {"image": image, "textured": textured, "weights": weights}
+    return {name: x.requires_grad_() for name, x in leaves.items()} | {"target": target}
 
 
-def terms_of(x: dict[str, Any], factors: LossWeights | None = None, **masks: Any) -> dict[str, torch.Tensor]:
+def terms_of(x: dict[str, torch.Tensor], factors: LossWeights | None = None, **masks: Any) -> dict[str, torch.Tensor]:
     camera, out = cast(nw.Camera, None), cast(nw.Rendering, SimpleNamespace(**x))
     return losses.photo_losses(out, nw.Target(camera, x["target"], 0.0, **masks), factors or LossWeights())
 
@@ -38,7 +34,6 @@ def terms_of(x: dict[str, Any], factors: LossWeights | None = None, **masks: Any
 def test_photo_losses_are_the_papers_total(slots: int, counted: int) -> None:
     """The heaviest hits count as textured for the term of the weights alone: the texture's has all of them."""
     x = arguments(slots)
-    x["weights"].requires_grad_()
     terms = terms_of(x)
     assert set(terms) == {"l1", "dssim", "texture", "alpha"}
     image, target = x["image"].clamp(0, 1), x["target"]
@@ -64,16 +59,8 @@ def test_terms_without_weight_or_input_are_not_computed(monkeypatch: pytest.Monk
 # What does not count, what is empty, and depths
 
 
-def scene_of_losses() -> dict[str, torch.Tensor]:
-    """Inputs of `photo_losses`; leaves but for the target."""
-    image, target = images()
-    shape = image.shape[:2]
-    leaves = {"image": image, "textured": 0.6 * image, "weights": torch.rand(*shape, 2, dtype=torch.float64)}
-    return {name: x.clone().requires_grad_() for name, x in leaves.items()} | {"target": target}
-
-
 def test_a_mask_leaves_no_gradient_where_it_is_false() -> None:
-    tensors = scene_of_losses()
+    tensors = arguments()
     mask = torch.rand(13, 17) < 0.7
     terms = terms_of(tensors, counts=mask)
     total(terms.values()).backward()
@@ -87,7 +74,7 @@ def test_a_mask_leaves_no_gradient_where_it_is_false() -> None:
 
 
 def test_where_nothing_is_only_the_image_counts() -> None:
-    tensors = scene_of_losses()
+    tensors = arguments()
     empty = torch.rand(13, 17) < 0.4
     terms = terms_of(tensors, empty=empty)
     expected = terms_of(tensors)

@@ -8,12 +8,11 @@ import nexwarp as nw
 from nexwarp.run.evaluate import evaluate
 from nexwarp.train.target import mean_color
 from tests.tolerances import assert_close
-from tests.trainer_support import TEXTURE
+from tests.trainer_support import small
 
 
-def make_trainer(scene: nw.Scene, **settings) -> nw.Trainer:
-    values: dict[str, Any] = {"iterations": 12, "max_surfels": 120, "texture": TEXTURE} | settings
-    return nw.Trainer(scene, nw.Config(**values), "cpu")
+def make_trainer(scene: nw.Scene, **settings: Any) -> nw.Trainer:
+    return nw.Trainer(scene, small(**settings), "cpu")
 
 
 def test_background_is_the_given_one_the_scenes_or_the_mean(scene: nw.Scene) -> None:

@@ -113,12 +113,7 @@ def changed(index: int, value: Any) -> Callable[[list[Any]], list[Any]]:
         ("cameras", lambda x: x[1:], ValueError, r"^cameras: expected 10, one for each image, got 9$"),
         ("cameras", changed(2, None), TypeError, r"^cameras\[2\]: expected a nexwarp.Camera, got NoneType$"),
         ("points", lambda x: x.long(), TypeError, r"^points: expected a floating dtype, got torch.int64$"),
-        (
-            "points",
-            lambda x: torch.where(x == x[5], torch.inf, x),
-            ValueError,
-            r"^points: .* at index .5",
-        ),
+        ("points", lambda x: torch.where(x == x[5], torch.inf, x), ValueError, r"^points: .* at index .5"),
         ("colors", lambda x: x[1:], ValueError, r"^colors: expected shape \(200, 3\), got \(199, 3\)$"),
         ("names", changed(4, "../x"), ValueError, r"^names\[4\]: '../x' leaves the images folder"),
         ("names", changed(4, "view_002.png"), ValueError, r"^names\[4\]: .* 'view_002.png' as of names\[2\]$"),

@@ -42,10 +42,7 @@ BAD = {
     "a number of 5,000 digits": (text('{"frames": [{"w": ' + "9" * 5000 + "}]}"), "could not parse"),
     "no frames": (spoilt(lambda data: data.pop("frames") and None), "frames: expected a list .*, got None"),
     "empty frames": (spoilt(lambda data: data["frames"].clear()), r"frames: expected a list .*, got \[\]"),
-    "frame that is none": (
-        spoilt(lambda data: data["frames"].append(7)),
-        r"frames\[10\]: expected a JSON object",
-    ),
+    "frame that is none": (spoilt(lambda data: data["frames"].append(7)), r"frames\[10\]: expected a JSON object"),
     "one frame": (spoilt(lambda data: data.update(frames=data["frames"][:1])), "at least 2 registered images"),
     "frame twice": (spoilt(lambda d: d["frames"].append(d["frames"][2])), "each photo once, got view_00.* twice"),
     "no file name": (frame(file_path=None), "frame 3: file_path: expected the name of a file, got None"),

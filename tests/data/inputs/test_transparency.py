@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from nexwarp.data import load_scene
 from nexwarp.data.random_points import random_points
-from tests.data.test_scene import make_scene, project, views_of
+from tests.data.test_scene import make_scene, views_of
 from tests.scene_writers import write_blender
 
 
@@ -69,8 +69,7 @@ def test_random_points_lie_where_the_cameras_look(demo, tmp_path, transparent):
     assert len(scene.points) == 4000 and torch.equal(scene.points, load_scene(tmp_path / "opaque").points)
     seen = torch.zeros(len(scene.points))
     for view in scene.train:
-        pixels = project(view.camera, scene.points)
-        depth = (scene.points @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3])[:, 2]
+        pixels, depth = view.camera.project(scene.points)
         seen += (depth > 0) & (pixels > -0.1).all(dim=1) & (pixels < torch.tensor([96.1, 72.1])).all(dim=1)
     assert seen.min() >= 2
     # The room's points, which the demo has, are among them: some lie near nearly each.
@@ -79,8 +78,7 @@ def test_random_points_lie_where_the_cameras_look(demo, tmp_path, transparent):
     path, _ = transparent
     hull = load_scene(path)
     for view in hull.train:  # the disc's rim is 12 pixels from the image's centre
-        pixels = project(view.camera, hull.points)
-        depth = (hull.points @ view.camera.viewmat[:3, :3].T + view.camera.viewmat[:3, 3])[:, 2]
+        pixels, depth = view.camera.project(hull.points)
         inside = (depth > 0.1) & (pixels > 0).all(dim=1) & (pixels < torch.tensor([48.0, 36.0])).all(dim=1)
         assert (pixels[inside] - torch.tensor([24.0, 18.0])).norm(dim=1).max() < 13 and inside.any()
     assert hull.colors[:, 0].float().min() >= 200 and len(hull.points) > 100
