@@ -13,6 +13,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 
+import numpy as np
 import torch
 
 from nexwarp.cameras.camera import Camera, visible_points
@@ -163,8 +164,10 @@ class TargetSource:
 
     def _depth_in(self, index: int) -> torch.Tensor | None:
         """Return the depth map of view `index`, 0 where it is masked; None without any, or without its loss."""
-        counted = self.config.losses.depth_maps > 0 and self.config.max_hits > 0
-        depth, mask = self.views.depth(index) if counted else None, self.views.mask(index)
+        if self.config.losses.depth_maps == 0 or self.config.max_hits == 0:
+            return None
+        depth = self.views.depth(index)
+        mask = None if depth is None else self.views.mask(index)
         return depth if depth is None or mask is None else depth * mask
 
     @cached_property
@@ -367,10 +370,10 @@ def mean_color(views: list[View], calibration: ExposureCalibration | None = None
     def light(numbered: tuple[int, View]) -> torch.Tensor:
         index, view = numbered
         falloff = None if calibration is None else calibration.exposures.falloff_of(view.camera)
-        values = view.image if falloff is None else view.image / falloff.double()
-        # Integers have the same sum in any order; rounding hides that of the others.
-        sums = values.sum((0, 1), dtype=torch.float64)
-        return sums if calibration is None else sums / calibration.gains[index].double()
+        shares = np.ones((1, 1)) if falloff is None else 1 / falloff[..., 0].double().numpy()
+        # Integers have the same sum in any order; rounding hides that of the others. No photo is copied as floats.
+        sums = np.einsum("hwc,hw->c", view.image.numpy(), np.broadcast_to(shares, view.image.shape[:2]))
+        return torch.from_numpy(sums if calibration is None else sums / calibration.gains[index].double().numpy())
 
     total = sum(in_threads(light, enumerate(views)), torch.zeros(3, dtype=torch.float64))
     pixels = sum(view.image.shape[0] * view.image.shape[1] for view in views)
