@@ -125,6 +125,8 @@ def _read_frames(file: Path, images: str, follow_links: bool, skip_missing: bool
         viewmat, lens = _frame_viewmat(where, entry, frames.to_original), _frame_lens(where, entry, data, photo_file)
         frames.photos.append(Photo(name, photo_file, viewmat, lens, test, mask, depth))
     report_missing(file, frames.missing, len(entries), skip_missing)
+    if not any(photo.test for photo in frames.photos):  # all of `test_frames` are missing
+        frames.photos[:] = [dataclasses.replace(photo, test=None) for photo in frames.photos]
     frames.photos.sort(key=lambda photo: photo.name)
     return frames
 

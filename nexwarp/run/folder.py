@@ -131,12 +131,13 @@ class RunRecord:
         """Read `as_dict`, of any version; one of `READ_ERRORS` says what is wrong with the entries."""
         check_version(data.get("format_version", 1), RUN_VERSION)
         source, init = SceneSource.from_dict(data["scene"]), data.get("init")
-        teachers = tuple(Path(path) for path in data.get("teachers", []))
+        if not isinstance(teachers := data.get("teachers", []), list):
+            raise ValueError(f"teachers: expected a list of paths, got {teachers!r:.60}")
         config, own = config_from_dict(data["config"]), _own_teachers(data.get("own_teachers"))
         if own.count * own.iterations >= config.iterations:
             raise ValueError(f"own_teachers: expected fewer iterations than the run's {config.iterations}, got {own}")
         start = None if init is None else Path(init)
-        return cls(source, config, str(data.get("device", "cpu")), teachers, own, start)
+        return cls(source, config, str(data.get("device", "cpu")), tuple(map(Path, teachers)), own, start)
 
 
 def _own_teachers(data: object) -> OwnTeachers:
@@ -192,7 +193,7 @@ def prepare_run(run: Path, source: SceneSource, *, resume: bool, overwrite: bool
     if source.path != DEMO and Path(source.path).resolve().is_relative_to(run.resolve()):
         raise SettingError(f"--run: expected a folder that does not contain the scene, got {run}")
     owner = run.resolve().parent.parent
-    if run.resolve().parent.name == TEACHERS_FOLDER and is_run(owner):
+    if run.resolve().parent.name == TEACHERS_FOLDER and run.name.isdecimal() and is_run(owner):
         raise RunError(f"--run: expected a run of its own, got {run}, a teacher of {owner}")
     if resume and is_run(run):
         return True

@@ -52,7 +52,7 @@ class TrainingLog:
 
     def __exit__(self, *_: object) -> None:
         if self.events is not None:
-            with suppress(OSError):  # of a full disk, which writing a line has told
+            with suppress(OSError):  # a full disk: the log of each line has told it, or the last event is lost
                 self.events.close()
 
     def __call__(self, step: StepReport) -> None:

@@ -311,6 +311,9 @@ def test_a_record_with_invalid_teachers_is_refused(tmp_path: Path) -> None:
         (run / "config.json").write_text(json.dumps(data))
         with pytest.raises(ValueError, match="own_teachers: expected"):
             read_run(run)
+    (run / "config.json").write_text(json.dumps(data | {"own_teachers": None, "teachers": "abc"}))
+    with pytest.raises(ValueError, match=r"teachers: expected a list of paths, got 'abc'"):
+        read_run(run)
     data["own_teachers"] = {"count": 2, "iterations": 4, "of a newer version": 1}
     (run / "config.json").write_text(json.dumps(data))
     assert read_run(run).own == OwnTeachers(2, 4)  # of a run from before, whose teachers have its budget

@@ -84,6 +84,14 @@ def test_names_and_encodings(tmp_path, kind):
         assert [view.name for view in scene.test] == ["0.png", "1.png"]
 
 
+def test_without_its_test_frames_a_scene_is_split_as_others(tmp_path):
+    path = bare(tmp_path)
+    for name in ("0.png", "1.png"):
+        (path / "images" / name).unlink()
+    with pytest.warns(UserWarning, match="2 of 6"):
+        assert [view.name for view in load_scene(path, skip_missing=True).test] == ["2.png"]
+
+
 def test_lists_name_photos_in_any_form(tmp_path):
     names = [unicodedata.normalize("NFD", f"images/\u00e9{index}.png") for index in range(room.VIEWS)]
     listed = [unicodedata.normalize("NFC", name) for name in names]
