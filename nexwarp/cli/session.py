@@ -233,11 +233,11 @@ class Session(StageStore):
         views, photos, rows = trainer.scene.test, trainer.views.refined(trainer.poses), dict[str, str]()
         options: dict[str, Any] = {"mask_mode": trainer.config.mask_mode, "ranks": self.ranks}
         with display.stages(self.console) as observe:
-            told = partial(observe, "judging photos")
-            judged = evaluate(model, photos, metrics=("psnr",), progress=told, **options)["views"]
+            judging, evaluating = partial(observe, "judging photos"), partial(observe, "evaluating")
+            judged = evaluate(model, photos, metrics=("psnr",), progress=judging, **options)["views"]
             if views:
-                told, renders = partial(observe, "evaluating"), self.run / RENDERS_FOLDER
-                results = evaluate(model, views, renders=renders, progress=told, **options)
+                renders = self.run / RENDERS_FOLDER
+                results = evaluate(model, views, renders=renders, progress=evaluating, **options)
                 rows, judged = figures(results), judged | results["views"]
                 if self.ranks.first:
                     write_json(self.run / METRICS_FILE, finite(facts | results))

@@ -166,17 +166,17 @@ class Train:
 
     def _plan(self, run: Path, ranks: Ranks, claim: ExitStack) -> tuple[RunRecord, bool]:
         """Claim the run folder, on rank 0; return the run, the same on all ranks, and whether to resume it."""
-        told: dict[str, Any] = {}
+        plan: dict[str, Any] = {}
         if ranks.first:
             self._check()
             claimed = claimed_run(run, self.scene, resume=self.resume, overwrite=self.overwrite)
             resume = claim.enter_context(claimed)
-            told = {"run": self._record(run, resume, ranks).as_dict(), "resume": resume}
-        told = ranks.share(told)
-        record = RunRecord.from_dict(told["run"])
+            plan = {"run": self._record(run, resume, ranks).as_dict(), "resume": resume}
+        plan = ranks.share(plan)
+        record = RunRecord.from_dict(plan["run"])
         # On another machine, the scene may lie elsewhere.
         source = dataclasses.replace(record.source, path=self.scene.path)
-        return dataclasses.replace(record, source=source), bool(told["resume"])
+        return dataclasses.replace(record, source=source), bool(plan["resume"])
 
     def _record(self, run: Path, resume: bool, ranks: Ranks) -> RunRecord:
         """Return the run of the options, which must agree with the run to resume."""

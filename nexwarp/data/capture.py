@@ -34,7 +34,7 @@ class Photo:
     file: Path
     viewmat: np.ndarray  # (4, 4) float64, world to camera, OpenCV axes; a capture's "world" has its `origin`
     lens: Lens  # the size of the image file may differ from the lens's by a factor
-    test: bool | None = None  # whether it is to judge by, not to learn from; None if the scene says it of no photo
+    test: bool | None = None  # whether it is a test photo; None if the scene has no split
     mask: Path | None = None  # None if the scene names none
     depth: Path | None = None  # its depth map; None if it has none
     face: str | None = None  # of a panorama, a key of `nexwarp.data.lens.FACES`; None for other photos

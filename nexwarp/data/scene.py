@@ -458,7 +458,7 @@ def _given_points(file: Path, capture: Capture) -> Cloud:
 
 
 def _read_capture(source: SceneSource) -> Capture:
-    """Read a capture without the photos to exclude, on which it does not depend which photos are for testing."""
+    """Read a capture without the excluded photos. The test photos are chosen before these are left out."""
     capture = _read_files(source)
     photos = [
         dataclasses.replace(photo, test=index % TEST_EVERY == 0 if photo.test is None else photo.test)

@@ -126,7 +126,7 @@ def misses_block(i: int, surfels: Surfels, d: Vec2, half: Vec2):
 
 @wp.func
 def stage(batch: int, end: int, surfels: Surfels, lists: TileLists, overflow: wp.bool, middle: Vec2, half: Vec2):
-    """Stage a warp's surfels from the place `batch` of the walk on, on CUDA but those that miss the whole block.
+    """Stage up to a warp's width of surfels from place `batch` on; CUDA leaves out those that miss the whole block.
 
     Return (number of surfels staged, this lane's surfel, -1 if it is not staged).
     """

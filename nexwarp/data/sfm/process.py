@@ -139,12 +139,12 @@ def _in_child(order: Order, scene: Path, observe: Observer) -> SfmReport:
         finally:
             child.wait()  # a `with` block waits a quarter of a second only after Ctrl-C
         words.seek(0)
-        told = words.read().decode(errors="replace")
+        text = words.read().decode(errors="replace")
     if isinstance(answer, SfmReport):
         return answer
     error = answer if isinstance(answer, Exception) else None
     if error is None:
-        error = SceneError(_end_of(order.source, child.returncode, told))
+        error = SceneError(_end_of(order.source, child.returncode, text))
     number = error.errno if isinstance(error, OSError) else None
     if PYCOLMAP in str(error):  # it seldom tells why
         number = errno.ENOSPC if FULL.search(str(error)) else _write_fault(order.folder)
