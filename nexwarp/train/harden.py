@@ -19,7 +19,7 @@ from nexwarp.train.trainer import Trainer
 OPACITY_FACTOR = 0.3  # of the surfels' mean opacity * (1 - opacity)
 LEAST_GAMMA = 3.0
 RISING = 0.6  # share of the iterations in which the factor and the least gamma rise
-EVERY = 10  # iterations between two steps of the least gamma
+EVERY = 10  # iterations between two rises of the least gamma
 
 
 def train_hard(
