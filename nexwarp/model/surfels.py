@@ -1,5 +1,6 @@
 """The surfels: geometry and plain (non-textured) appearance (paper Sec. 4.1)."""
 
+import math
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -206,6 +207,12 @@ class Surfels(nn.Module):
     def gammas(self) -> torch.Tensor:
         """(N, 2) exponents of the generalised Gaussian (paper Eq. 3), >= 1."""
         return 1 + self.raw_gammas.exp()
+
+    @torch.no_grad()
+    def sharpen(self, least_gamma: float) -> None:
+        """Raise gammas below a least one, >= 1, to it, in place."""
+        if least_gamma > 1:
+            self.raw_gammas.clamp_(min=math.log(least_gamma - 1))
 
     @property
     def sh(self) -> torch.Tensor:

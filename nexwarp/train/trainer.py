@@ -29,6 +29,7 @@ from nexwarp.train.state import TrainingState, check_origin, check_snapshot, sce
 from nexwarp.train.target import Target, TargetSource, TaughtTargets, check_teachers, refined, teachers_digest
 
 CHECK_EVERY = 100  # iterations between checks that all numbers are finite
+SHARPEN_EVERY = 10  # iterations between two calls of `Surfels.sharpen`
 
 
 class Trainer(TrainingState):
@@ -131,9 +132,12 @@ class Trainer(TrainingState):
             result = self._run_step(target)
             if self.densifier.due(self.iteration, self.views_a_step):
                 self._control_density()
-            return StepReport(
+            report = StepReport(
                 self.iteration, len(self.surfels), result.losses, result.image, target.photo, self.views_a_step
             )
+            if report.passed(SHARPEN_EVERY) or self.iteration >= self.config.iterations:
+                self.surfels.sharpen(self.config.least_gamma_at(self.iteration))
+            return report
 
     def _next_target(self) -> Target:
         self.iteration += 1

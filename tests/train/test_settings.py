@@ -76,7 +76,7 @@ def test_paper_is_the_paper():
     p = preset("paper")
     assert (p.preset, p.iterations, p.max_hits, p.sh_degree, p.sh_every) == ("paper", 30_000, 2, 3, 1000)
     assert (p.max_surfels, p.background, p.more_hits_from, p.mask_mode) == (400_000, (0.0, 0.0, 0.0), 0, "ignore")
-    assert not any((p.filter_points, p.orient_points, p.footprints, p.smooth_sh, p.exposures))
+    assert not any((p.filter_points, p.orient_points, p.footprints, p.smooth_sh, p.exposures)) and p.least_gamma == 1
     zero = {"depth": 0.0, "depth_maps": 0.0}
     assert p.losses == recipe.LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, **zero)
     constant = {"quats": 1e-3, "scales": 5e-3, "opacities": 0.025, "gammas": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
@@ -105,9 +105,9 @@ def test_runs_from_before_a_setting_keep_what_they_did():
     assert config_from_dict(written) == Config()
     del written["densify"]["relocate"]
     assert config_from_dict(written).densify == dataclasses.replace(recipe.DensifyConfig(), relocate=0.0)
-    del written["skybox"], written["teachers"]
+    del written["skybox"], written["teachers"], written["least_gamma"]
     found = config_from_dict(written)
-    assert (found.skybox, found.teachers, Config().teachers) == (0, 0, None)
+    assert (found.skybox, found.teachers, Config().teachers, found.least_gamma) == (0, 0, None, 1.0)
 
 
 @pytest.mark.parametrize("change", [lambda d: d | {"texture": 3}, lambda d: d | {"iterations": "many"}, lambda _: []])

@@ -129,6 +129,15 @@ def test_surfels_settle_with_two_hits(scene):
         assert nw.Trainer(scene, small(iterations=12, max_hits=hits), "cpu").render_options().max_hits == hits
 
 
+def test_surfels_get_sharper_in_the_middle_of_a_run(scene):
+    config, least = small(iterations=40, least_gamma=3.0), dict[int, float]()
+    assert [config.least_gamma_at(i) for i in (1, 12, 22, 32, 40)] == pytest.approx([1, 1, 2, 3, 3])
+    trainer = nw.Trainer(scene, config, "cpu")
+    trainer.run(lambda step: least.update({step.iteration: trainer.surfels.gammas.min().item()}))
+    assert max(least[i] for i in range(1, 20)) < 1.1  # bounds hold from every tenth iteration on
+    assert [least[i] for i in (20, 30, 40)] == pytest.approx([1.8, 2.8, 3.0], rel=1e-6)
+
+
 @pytest.mark.parametrize("factor", [64.0, 1 / 64])
 def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor):
     """By a power of two most roundings are the same, too; Adam carries on what others leave as it does gradients."""
