@@ -32,14 +32,14 @@ from nexwarp.io.pictures import linear_light
 from nexwarp.io.ply import write_elements
 from nexwarp.kernels.sh import BAND_0
 from nexwarp.kernels.types import ALPHA_MAX, ALPHA_MIN
-from nexwarp.model.surfels import Surfels
+from nexwarp.model.surfels import SOFT, Surfels
 
 MAX_EXTENT = 0.3  # largest scale of an exported Gaussian, as a fraction of its distance to the nearest camera
 THINNESS = 1e-3  # third scale of an exported Gaussian, as a fraction of the surfel's smaller scale
 SPLATTING = "KHR_gaussian_splatting"  # extension of glTF
 SPLAT_DEGREE = 3  # SH degree whose coefficients viewers expect
 SURFELS = "nexwarp surfels: gamma = 1 + exp(gamma_i), scale = exp(scale_i), opacity = sigmoid(opacity), rot is wxyz"
-SPLATS = "nexwarp surfels as 3DGS Gaussians: the plain appearance, without texture, with gamma = 1"
+SPLATS = "nexwarp surfels as 3DGS Gaussians: the plain appearance, without texture"
 
 SPACING = 1.4  # between neighbouring pieces, in their standard deviations: leaves a ripple below 2 %
 MOST_STEPS = 16  # pieces on either side of a surfel's centre, along one axis
@@ -99,17 +99,28 @@ class Gaussians:
 
 
 @torch.no_grad()
+def softened(surfels: Surfels) -> Surfels:
+    """Return Gaussian surfels whose alpha has the same integral along each axis as that of these, paper Eq. 3."""
+    raw, halves = surfels.state_dict(), 0.5 / surfels.gammas
+    # exp(-|u|^(2 gamma) / 2) has the integral 2 * 2^halves * Gamma(1 + halves), and a Gaussian (2 pi)^(1/2).
+    raw["log_scales"] = raw["log_scales"] + halves * math.log(2) + torch.lgamma(1 + halves) - math.log(math.pi / 2) / 2
+    raw["raw_gammas"] = torch.full_like(raw["raw_gammas"], SOFT)
+    return Surfels(raw)
+
+
+@torch.no_grad()
 def gaussians(
     surfels: Surfels,
     sh_degree: int = SPLAT_DEGREE,
     cameras: Sequence[Camera] = (),
     max_extent: float = MAX_EXTENT,
 ) -> Gaussians:
-    """Return surfels as Gaussians of SH degree 0 to 3, without the texture and with gamma = 1.
+    """Return surfels as Gaussians of SH degree 0 to 3, `softened` and without the texture.
 
     Each surfel becomes a flat Gaussian, whose third scale is a thousandth of the smaller of the other two, or several
     of them, which come last: a scale is at most `max_extent` of the distance to the nearest of the cameras.
     """
+    surfels = softened(surfels)
     raw = surfels.state_dict()
     pieces = split_large(surfels.means, surfels.scales, surfels.opacities, cameras, max_extent)
     ids, whole = pieces.ids, pieces.whole
@@ -280,7 +291,7 @@ class Pieces:
 def split_large(
     means: torch.Tensor, scales: torch.Tensor, opacities: torch.Tensor, cameras: Sequence[Camera], max_extent: float
 ) -> Pieces:
-    """Split surfels of which a scale is above `max_extent` of their distance to a camera. Gamma is taken as 1.
+    """Split Gaussians of which a scale is above `max_extent` of their distance to a camera.
 
     The surfels that are small enough come first, in order, then pieces of the others; very many, in coarser grids.
     """

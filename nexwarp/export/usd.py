@@ -39,9 +39,9 @@ def save_usdz(
     """Write cards and surfels as one USDZ file, atomically; the default prim's variant `shown` chooses between them.
 
     `Cards`, which is shown at first, is a mesh of quads with one unlit UsdPreviewSurface. `Surfels` is a particle field
-    with the kernel of Gaussian surflets: the plain appearance, with gamma = 1, and SH up to `sh_degree`. `Collision`,
-    if given, is a mesh that is not shown, for physics. The mean of the cameras' upward directions becomes +y, by the
-    default prim. FormatError: there are no cards.
+    with the kernel of Gaussian surflets: the plain appearance, with the surfels' integrals, and SH up to `sh_degree`.
+    `Collision`, if given, is a mesh that is not shown, for physics. The mean of the cameras' upward directions becomes
+    +y, by the default prim. FormatError: there are no cards.
     """
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdUtils
 

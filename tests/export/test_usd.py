@@ -11,6 +11,7 @@ from nexwarp.cameras.similarity import upright
 from nexwarp.errors import FormatError
 from nexwarp.export.glb import bake_cards, quads
 from nexwarp.export.mesh import Mesh
+from nexwarp.export.splats import gaussians
 from nexwarp.export.usd import save_usdz
 from nexwarp.io.pictures import to_uint8
 from nexwarp.kernels.sh import BAND_0
@@ -71,7 +72,7 @@ def test_a_stage_has_the_cards_and_the_surfels(made, tmp_path):
     turned = field.GetAttribute("orientations").Get()
     quats = torch.tensor([[q.GetReal(), *q.GetImaginary()] for q in turned])
     assert_close(quats, surfels.quats, kind="value", name="orientations")
-    assert_close(values("scales")[:, :2], surfels.scales, kind="value", name="scales")
+    assert_close(values("scales").log(), gaussians(surfels, 1).log_scales, kind="value", name="scales")
     assert_close(values("opacities"), surfels.opacities, kind="value", name="opacities")
     sh = values("radiance:sphericalHarmonicsCoefficients").view(len(surfels), 4, 3)
     assert sh.equal(torch.cat([surfels.sh0, surfels.shN[:, :3]], dim=1).detach())
