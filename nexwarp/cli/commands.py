@@ -27,7 +27,7 @@ from nexwarp.model.edit import write_edits
 from nexwarp.model.texture import NeuralTexture
 from nexwarp.run.edit import EditOrder, added, crop_command, described, measured
 from nexwarp.run.evaluate import check_metrics, evaluate
-from nexwarp.run.export import RENDERED, ExportOrder, export_run
+from nexwarp.run.export import STAGED, ExportOrder, export_run
 from nexwarp.run.fit_poses import fit_poses
 from nexwarp.run.folder import (
     METRICS_FILE,
@@ -220,12 +220,12 @@ class Export:
     run: Run_
     files: tyro.conf.OmitArgPrefixes[ExportOrder] = dataclasses.field(default_factory=ExportOrder)
     device: Device_ = None
-    """Device for mesh, web, glb and usd, which render."""
+    """Device that renders and trains, for all formats but compact and cameras."""
 
     def __call__(self, console: Console) -> None:
         """Export."""
         device, opened, lines = pick_device(self.device), open_model(self.run), list[str]()
-        if self.files.format in RENDERED:
+        if self.files.format in STAGED:
             with display.stages(console) as observe:
                 files = export_run(opened, self.files, device, observe, lines.append)
         else:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated, TypeAlias, cast
+from typing import Annotated, NamedTuple, TypeAlias, cast
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ from nexwarp.export.splats import (
     save_splats_ply,
     save_splats_spz,
     save_surfels_ply,
+    softened,
 )
 from nexwarp.export.usd import save_usdz
 from nexwarp.export.web.export import Page, export_web, read_notes
@@ -48,16 +49,17 @@ from nexwarp.run.edit import MIDDLE, edited, subject_crop
 from nexwarp.run.evaluate import METRICS, compared, weights_file
 from nexwarp.run.folder import EXPORT_FOLDER, EXPORTS, METRICS_FILE, ORIGIN_FILE, TRAIN, OpenedModel, read_metrics
 from nexwarp.train.api import train
-from nexwarp.train.harden import train_hard
 from nexwarp.train.recipe import DEFAULT, MASK_MODES, MIN_SURFELS, with_settings
 from nexwarp.train.report import StepReport
 
 # Packages that formats need, and their extras.
 PACKAGES = {"glb": ("trimesh", "glb"), "spz": ("gaussforge", "splats"), "usd": ("pxr", "usd")}
-RENDERED = ("mesh", "web", "glb", "usd")  # formats that are made of renderings, stage by stage
 CARDS = ("glb", "usd")  # formats for other programs, whose scenes have objects
-BAKED = ("web", *CARDS)  # formats whose texture is baked, and fitted to photos
-READ = ("web", "glb")  # of these, those that can be read back
+BAKED = ("web", *CARDS)  # formats whose texture is baked
+SPLATS = ("ply", "spz", "gltf-splats")
+FITTED = (*BAKED, *SPLATS)  # formats that are fitted to photos
+STAGED = ("mesh", *FITTED)  # formats that take several stages, which are shown
+READ = ("web", "glb")  # formats whose files `load_baked` reads
 # Options of one format.
 OPTIONS = {
     "mesh": ("voxel", "far"),
@@ -67,8 +69,25 @@ OPTIONS = {
 Device: TypeAlias = torch.device | str
 Figures = dict[str, dict[str, float]]  # metrics on test views, of what was baked and of the model
 GREY_LEVEL = 1 / 255
-# Shares of a run's iterations: training with one colour from all directions (blended cards), hardening (cut-outs).
-DIFFUSE_SHARE, HARD_SHARE = 1 / 4, 1.0
+ONE_COLOR: dict[str, object] = {"sh_degree": 0, "smooth_sh": 0.0}  # from all directions, as cards have
+STEADY: dict[str, object] = {"densify.fraction": 0.0, "densify.relocate": 0.0}
+
+
+class Form(NamedTuple):
+    """What other renderers draw, for which training goes on: share of the run's iterations, surfels, and settings."""
+
+    share: float
+    growth: int  # at most so many times the surfels of the run
+    settings: dict[str, object]
+
+
+FORMS = {
+    "blended cards": Form(1 / 4, 1, ONE_COLOR | STEADY),
+    # Where a renderer tests depth and does not blend, nearly opaque surfels with hard sides lose least.
+    "cut-outs": Form(1.0, 1, ONE_COLOR | {"least_gamma": 3.0, "losses.binary": 0.3}),
+    # More of them make up for the texture.
+    "Gaussians": Form(1 / 2, 4, {"max_hits": 0, "least_gamma": 1.0, "rates.gammas": 0.0, "footprints": False}),
+}
 COLLISION_VOXELS = 48  # along the scene's longest side
 FAR_AROUND = 10.0  # so many times the subject, what lies around an object is left out
 UNDISTORTED = "undistorted"  # folder of names of views that no file shows
@@ -87,7 +106,7 @@ class ExportOrder:
     alpha: Annotated[str, option("{mask,blend}")] = "mask"
     """Of glb, usd: mask cuts surfels out, which all programs draw; blend is closer to photos, in those that sort."""
     finetune: Annotated[bool, option(None, "to the training photos, where they are")] = True
-    """Fit what is baked to the model's renderings alone, without more training."""
+    """Train no more: fit what is baked to the model's renderings alone, and write the run's own surfels as splats."""
     crop: Annotated[
         bool, option(None, "glb and usd keep what photos all around look at, if the scene is ten times as large")
     ] = True
@@ -143,7 +162,7 @@ def export_run(
 ) -> Sequence[Path]:
     """Export a run or a model, and return the files that were written; docs/outputs.md describes them.
 
-    `device` renders what a mesh or a baked texture is made of; `observe` is called with the name of each of their
+    `device` renders and trains; `observe` is called with the name of each of their
     stages, how many views, blocks or steps of it are done, and of how many; `report` with a line that tells how close
     a baked file comes to the test photos.
     """
@@ -151,8 +170,7 @@ def export_run(
     folder = order.out or opened.folder / EXPORT_FOLDER
     if order.crop and order.format in CARDS:
         opened = _cropped(opened, report)
-    fitted = order.format in BAKED and order.finetune and opened.source is not None
-    scene = _photos(opened, device, observe) if fitted else None
+    scene = _photos(opened, device, observe) if _learns(opened, order, device, report) else None
     files = [*_export(opened, order, folder, scene, device, observe)]
     beside = folder.parent if folder.suffix == ".html" else folder
     if scene is not None and scene.test and order.format in READ:
@@ -168,6 +186,16 @@ def export_run(
         meaning = "world position = origin + exported position"
         write_json(files[-1], {"origin": opened.model.origin, "meaning": meaning})
     return files
+
+
+def _learns(opened: OpenedModel, order: ExportOrder, device: Device, report: Callable[[str], object]) -> bool:
+    """Whether an export learns from the run's photos; say where splats do not because that would take hours."""
+    if not order.finetune or opened.source is None or (order.format in SPLATS and _is_cropped(opened)):
+        return False
+    if order.format in SPLATS and opened.device == "cuda" and torch.device(device).type == "cpu":
+        report("splats are the run's own surfels: without its GPU, training them further would take hours")
+        return False
+    return order.format in FITTED
 
 
 def _cropped(opened: OpenedModel, report: Callable[[str], object]) -> OpenedModel:
@@ -204,7 +232,8 @@ def _export(
         voxel, far = (None if x is None else x / opened.frame.scale for x in (order.voxel, order.far))
         save_mesh(files[0], _mesh(opened, device, observe, voxel, far))
     else:
-        _export_splats(opened, order, files)
+        model = opened.model if scene is None else _trained_on(opened, scene, device, "Gaussians", observe)
+        _export_splats(opened, model, order, files)
     return files
 
 
@@ -221,7 +250,8 @@ def _export_baked(
     if order.format == "web":
         page, out = _page(opened, order), order.out or file
         return export_web(aim, views, out, seen, quality=order.quality, page=page, progress=observe)
-    model = aim if scene is None else _for_cards(opened, scene, device, order.alpha, observe)
+    form = "cut-outs" if order.alpha == "mask" else "blended cards"
+    model = aim if scene is None else _trained_on(opened, scene, device, form, observe)
     cards = bake_cards(model, seen or [*views.values()], order.alpha, aim=aim, progress=observe)
     means, quats = moved_poses(cards.shape.means, cards.shape.quats, motion)
     shape = cards.shape._replace(means=means, quats=quats, scales=cards.shape.scales * motion.scale)
@@ -230,23 +260,24 @@ def _export_baked(
         save_glb(file, cards, cameras)
     else:
         collision = _collision(opened, device, observe) if order.collision else None
-        surfels, degree = moved_surfels(opened.model.surfels, motion), opened.model.options.sh_degree
-        save_usdz(file, cards, surfels, min(degree, SPLAT_DEGREE), cameras, collision)
+        soft = opened.model if scene is None else _trained_on(opened, scene, device, "Gaussians", observe)
+        degree = min(soft.options.sh_degree, SPLAT_DEGREE)
+        save_usdz(file, cards, moved_surfels(soft.surfels, motion), degree, cameras, collision)
     return [file]
 
 
-def _export_splats(opened: OpenedModel, order: ExportOrder, files: Sequence[Path]) -> None:
-    """Write surfels as Gaussians; PLY also with all their properties."""
-    surfels = moved_surfels(opened.model.surfels, opened.frame)
+def _export_splats(opened: OpenedModel, model: Model, order: ExportOrder, files: Sequence[Path]) -> None:
+    """Write a model's surfels as Gaussians; PLY also those of the run, with all their properties."""
+    surfels = moved_surfels(model.surfels, opened.frame)
     cameras = [opened.frame.camera(camera) for camera in opened.views.values()]
-    degree = min(opened.model.options.sh_degree, SPLAT_DEGREE)
+    degree = min(model.options.sh_degree, SPLAT_DEGREE)
     splats = gaussians(surfels, degree, cameras, order.max_extent)
     if order.format == "gltf-splats":
         save_splats_glb(files[0], splats, cameras)
     elif order.format == "spz":
         save_splats_spz(files[0], splats)
     else:
-        save_surfels_ply(files[0], surfels)
+        save_surfels_ply(files[0], moved_surfels(opened.model.surfels, opened.frame))
         save_splats_ply(files[1], splats)
 
 
@@ -276,35 +307,39 @@ def _collision(opened: OpenedModel, device: Device, observe: Progress) -> Mesh:
     return _mesh(opened, device, observe, float((high - low).max()) / COLLISION_VOXELS)
 
 
-def _for_cards(opened: OpenedModel, scene: Scene, device: Device, alpha: str, observe: Progress) -> Model:
-    """Train a run on for cards: with one colour from all directions; for cut-outs, also hardened.
+def _trained_on(opened: OpenedModel, scene: Scene, device: Device, form: str, observe: Progress) -> Model:
+    """Train a run on for one of `FORMS`.
 
-    Returns the model unchanged where it is cropped, as the photos then have no loss around its edge, and where its
-    texture cannot be baked. Warns and returns it unchanged where training fails.
+    Returns the model unchanged where it is cropped, as the photos then have no loss around its edge, and where cards
+    are made of a texture that cannot be baked. Warns and returns it unchanged where training fails.
     """
     before, config = opened.model, opened.config or DEFAULT
-    if _is_cropped(opened) or type(before.texture) is not NeuralTexture:
+    if _is_cropped(opened) or (form != "Gaussians" and type(before.texture) is not NeuralTexture):
         return before.to(device)
-    hard = alpha == "mask"
-    iterations = max(round((HARD_SHARE if hard else DIFFUSE_SHARE) * config.iterations), 1)
-    settings: dict[str, object] = dict.fromkeys(("sh_degree", "teachers", "smooth_sh"), 0)
-    if not hard:
-        settings |= {"densify.fraction": 0.0, "densify.relocate": 0.0}
-    settings |= {"exposures": before.exposures is not None, "max_surfels": max(len(before.surfels), MIN_SURFELS)}
-    settings |= {"background": before.options.background, "iterations": iterations, "steps_a_photo": None}
-    config = with_settings(config, settings | {"refine_poses": False, "mask_mode": MASK_MODES[0]})
-    stage = "training opaque surfels" if hard else "training with one colour from all directions"
+    share, growth, changes = FORMS[form]
+    iterations = max(round(share * config.iterations), 1)
+    settings: dict[str, object] = {
+        "exposures": before.exposures is not None,
+        "max_surfels": max(growth * len(before.surfels), MIN_SURFELS),
+        "background": before.options.background,
+        "iterations": iterations,
+        "steps_a_photo": None,
+        "teachers": 0,
+        "refine_poses": False,
+        "mask_mode": MASK_MODES[0],
+    }
+    config = with_settings(config, settings | changes)
+    init = before
+    if form == "Gaussians":
+        init = Model(softened(before.surfels), None, options=before.options, meta=before.meta)
 
     def report(step: StepReport) -> None:
-        observe(stage, step.iteration, iterations)
+        observe(f"training {form}", step.iteration, iterations)
 
     try:
-        if hard:
-            model = train_hard(scene, config, device, before, report)
-        else:
-            model = train(scene, config, device=device, init=before, callbacks=[report])
+        model = train(scene, config, device=device, init=init, callbacks=[report])
     except (ValueError, DivergedError, OutOfMemoryError) as error:
-        why = f"the model is not trained for cards ({one_line(error)})"
+        why = f"the model is not trained for {form} ({one_line(error)})"
         warnings.warn(f"{why}; --no-finetune leaves that out", stacklevel=2)
         return before.to(device)
     model.exposures = None if before.exposures is None else before.exposures.to(device)
@@ -317,6 +352,7 @@ def _photos(opened: OpenedModel, device: Device, observe: Progress) -> Scene | N
     Masks leave out what a crop has changed.
     """
     assert opened.source is not None
+    model = opened.model  # before the photos, so that a damaged one is told at once
     try:
         scene = opened.source.load(lambda done, total: observe("reading photos", done, total))
     except (OSError, ValueError, MemoryError) as error:
@@ -324,12 +360,12 @@ def _photos(opened: OpenedModel, device: Device, observe: Progress) -> Scene | N
         return None
     mode, groups = (opened.config or DEFAULT).mask_mode, []
     for views in (scene.train, scene.test):
-        shown = [(view, *compared(opened.model, view, mode)) for view in views]
+        shown = [(view, *compared(model, view, mode)) for view in views]
         groups.append([replace(view, image=image, mask=mask) for view, image, mask in shown])
     cameras = opened.cameras.get(TRAIN, {})
     groups[0] = [replace(view, camera=cameras.get(view.name, view.camera)) for view in groups[0]]
     if _is_cropped(opened):
-        models = [model.bare().to(device) for model in (opened.trained, opened.model)]
+        models = [each.bare().to(device) for each in (opened.trained, model)]
         groups = [[_masked(view, *models) for view in group] for group in groups]
     test = [view for view in groups[1] if view.mask is None or view.mask.any()]
     return replace(scene, train=groups[0], test=test)

@@ -391,6 +391,7 @@ class OpenedModel:
     file: Path  # the model's; a run that has not finished has none yet
     source: SceneSource | None  # the run's scene
     config: Config | None  # the run's settings
+    device: str = "cpu"  # type of the device on which the run began
 
     @property
     def title(self) -> str:
@@ -466,7 +467,7 @@ def open_model(path: Path) -> OpenedModel:
             folder = path.with_name(f"{path.name}.results")  # another model's folder is left alone
     if is_run(folder) and file == folder / MODEL_FILE:
         record = read_run(folder)
-        return OpenedModel(path, folder, file, record.source, record.config)
+        return OpenedModel(path, folder, file, record.source, record.config, record.device)
     if not file.is_file():
         raise MissingError(
             f"{path}: expected a run folder or a model, found no {CONFIG_FILE} and no {MODEL_FILE} there"

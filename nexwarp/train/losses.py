@@ -147,6 +147,9 @@ def step_losses(
     losses = photo_losses(out, target, factors)
     if factors.opacity > 0:
         losses["opacity"] = factors.opacity * state.surfels.opacities.mean()
+    if factors.binary > 0:
+        opacities = state.surfels.opacities
+        losses["binary"] = factors.binary * (opacities * (1 - opacities)).mean()
     if target.empty is not None and factors.empty > 0:
         losses["empty"] = factors.empty * (out.alpha * target.empty).mean()
     if target.places is not None and target.expected is not None:

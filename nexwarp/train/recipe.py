@@ -90,6 +90,8 @@ class LossWeights(Settings):
     """Factor of the L1 distance between the un-premultiplied textured colours and the photo."""
     opacity: float = within(0.01, 0.0)
     """Factor of the surfels' mean opacity; makes them sparse."""
+    binary: float = within(0.0, 0.0)
+    """Factor of the surfels' mean of opacity (1 - opacity); makes them opaque, or removes them."""
     grid: float = within(0.01, 0.0)
     """Factor of the hash grid's squared values, each level divided by its resolution cubed."""
     empty: float = within(0.1, 0.0)
