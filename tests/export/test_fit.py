@@ -20,7 +20,7 @@ STEPS = 60
 @pytest.fixture(scope="module")
 def model(tiny_scene: nw.Scene) -> nw.Model:
     texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
-    return nw.train(tiny_scene, nw.Config(iterations=150, max_surfels=400, texture=texture))
+    return nw.train(tiny_scene, nw.Config(iterations=150, max_surfels=400, texture=texture, least_gamma=1.0))
 
 
 def quality(scene: BakedScene, model: nw.Model, views: Sequence[nw.View]) -> float:
@@ -31,8 +31,8 @@ def quality(scene: BakedScene, model: nw.Model, views: Sequence[nw.View]) -> flo
         return fmean(psnr(x * f, view.image, view.mask) for x, f, view in zip(images, factors, views, strict=True))
 
 
-# PSNR gained on the training photos, dB: 1.7, 1.1 and 2.3 were seen.
-@pytest.mark.parametrize(("form", "gain"), [("page", 1.5), ("mask", 1.0), ("blend", 2.0)])
+# PSNR gained on the training photos, dB: 1.7, 1.0 and 2.8 were seen.
+@pytest.mark.parametrize(("form", "gain"), [("page", 1.5), ("mask", 1.0), ("blend", 2.5)])
 def test_photos_help_each_form(form, gain, model, tiny_scene):
     views, results = tiny_scene.train, []
     for seen in ([view.camera for view in views], views):

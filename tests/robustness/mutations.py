@@ -33,10 +33,15 @@ class Mutation(NamedTuple):
 
 MUTATIONS = [
     # 1: kernels
+    Mutation(KERNELS + "types.py", "ALPHA_MAX = 0.99\n", "ALPHA_MAX = 0.999\n", AGREE),
     Mutation(KERNELS + "types.py", "ALPHA_MIN = 1.0 / 255.0", "ALPHA_MIN = 1.0 / 256.0", AGREE),
+    Mutation(KERNELS + "types.py", "TRANSMITTANCE_MIN = 1e-4", "TRANSMITTANCE_MIN = 2e-4", AGREE),
+    Mutation(KERNELS + "shape.py", "-0.5 / math.log(2.0)", "-0.501 / math.log(2.0)", AGREE),
     Mutation(KERNELS + "shape.py", "wp.where(alpha < type(u)(CAP), grad_alpha", "wp.where(True, grad_alpha", AGREE),
     Mutation(KERNELS + "shape.py", "half / gamma[1])", "half / gamma[0])", AGREE),
     Mutation(KERNELS + "surfel.py", "grad_m = grad_depth * inverse", "grad_m = -grad_depth * inverse", AGREE),
+    Mutation(KERNELS + "surfel.py", "two * (x * z - w * y)),", "two * (x * z + w * y)),", AGREE),
+    Mutation(KERNELS + "walk.py", "half = type(view.near)(0.5)", "half = type(view.near)(0.49)", AGREE),
     Mutation(KERNELS + "collect.py", "displaced or weight > w_", "displaced or weight >= w_", "tests/ops -k equal_weights"),
     Mutation(KERNELS + "collect.py", "if alpha >= ALPHA_MIN and depth > view.near and", "if alpha >= ALPHA_MIN and", AGREE),
     Mutation(KERNELS + "collect_backward.py", "alpha >= ALPHA_MIN and depth > view.near)", "alpha >= ALPHA_MIN)", AGREE),
@@ -45,6 +50,9 @@ MUTATIONS = [
     Mutation(KERNELS + "compose.py", "(ONE - layers.alphas[p])", "layers.alphas[p]", AGREE),
     Mutation(KERNELS + "compose.py", "-wp.dot(of_image, layers.background[0])", "wp.dot(of_image, layers.background[0])", AGREE),
     Mutation(KERNELS + "hashgrid.py", "2 * i - 1, -2 * i", "2 * i, -2 * i", AGREE),
+    Mutation(KERNELS + "hashgrid.py", "wp.uint32(805459861)", "wp.uint32(805459863)", AGREE),
+    Mutation(KERNELS + "hashgrid.py", "1.0 / (2.0 * math.pi)", "1.0 / (2.1 * math.pi)", AGREE),
+    Mutation(KERNELS + "sh.py", "0.4570457994644658", "0.4593", "tests/kernels/test_sh.py"),
     Mutation(KERNELS + "sh.py", "if color[c] > type(color[c])(0.0)", "if color[c] >= type(color[c])(0.0)", "tests/kernels/test_sh.py"),
     Mutation(KERNELS + "detail.py", "opacity * x * y, wp.vector", "opacity * x, wp.vector", "tests/ops/test_antialias.py"),
     Mutation(KERNELS + "adam.py", "* correction + epsilon)", "+ epsilon)", "tests/ops/test_adam.py"),
