@@ -164,10 +164,7 @@ def execute(run, tmp_path, monkeypatch) -> Callable[[str], list[dict[str, Any]]]
     return executed
 
 
-def test_the_python_of_paper_and_migrating_runs(execute, run, capsys):
-    execute("docs/paper.md")
-    metrics = read(run, "metrics.json")
-    assert capsys.readouterr().out == f"{ {key: metrics[key] for key in ('psnr', 'ssim', 'megabytes', 'seconds')} }\n"
+def test_the_migrating_page_s_python_runs(execute):
     (names,) = execute("docs/migrating.md")
     assert names["image"].shape == (200, 300, 3) and names["image"].max() > 0.1
 
