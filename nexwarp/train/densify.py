@@ -117,9 +117,7 @@ class DensityControl:
         if len(rows) != len(self.errors):
             self.errors = self.errors[rows]
         if split or len(rows) != len(self.surfels):
-            split_surfels(self.surfels, optimizer, rows, sides)
-            for module, name in along:
-                _take_rows(module, name, optimizer, rows, sides)
+            split_surfels(self.surfels, optimizer, rows, sides, along)
         return rows
 
     def _plan(
@@ -174,14 +172,21 @@ class DensityControl:
 
 
 @torch.no_grad()
-def split_surfels(surfels: Surfels, optimizer: torch.optim.Optimizer, rows: torch.Tensor, sides: torch.Tensor) -> None:
+def split_surfels(
+    surfels: Surfels,
+    optimizer: torch.optim.Optimizer,
+    rows: torch.Tensor,
+    sides: torch.Tensor,
+    along: Iterable[tuple[nn.Module, str]] = (),
+) -> None:
     """Make the surfels the given rows (M,) of themselves, and halves of these where sides (M,) are -1 or 1, not 0.
 
-    Halves lie along the longer axis: scale / 2, centres at -+ scale / 2.
+    Halves lie along the longer axis: scale / 2, centres at -+ scale / 2. `along` is that of `DensityControl.step`.
     """
-    for name in PARAMETERS:
-        _take_rows(surfels, name, optimizer, rows, sides)
     children = sides.nonzero()[:, 0]
+    moved = (rows != torch.arange(len(rows), device=rows.device)).nonzero()[:, 0]
+    for module, name in [*((surfels, name) for name in PARAMETERS), *along]:
+        _take_rows(module, name, optimizer, rows, moved, children)
     log_scales, means = surfels.log_scales[children], surfels.means[children]
     axis, at = log_scales.argmax(dim=1), torch.arange(len(children), device=children.device)
     x_axis, y_axis, _ = axes(surfels.quats[children])
@@ -192,29 +197,36 @@ def split_surfels(surfels: Surfels, optimizer: torch.optim.Optimizer, rows: torc
 
 
 def _take_rows(
-    module: nn.Module, name: str, optimizer: torch.optim.Optimizer, rows: torch.Tensor, sides: torch.Tensor
+    module: nn.Module,
+    name: str,
+    optimizer: torch.optim.Optimizer,
+    rows: torch.Tensor,
+    moved: torch.Tensor,
+    children: torch.Tensor,
 ) -> None:
     """Replace a parameter or buffer by the given rows (M,) of it, and the optimizer's state; zero state for children.
 
-    As many rows as before are written in place.
+    Of as many rows as before, those that were `moved` are written in place.
     """
     path, _, leaf = name.rpartition(".")
     owner = module.get_submodule(path)
     old: torch.Tensor = getattr(owner, leaf)
     state = optimizer.state.get(old, {})
-    moved = {key: x[rows] for key, x in state.items() if isinstance(x, torch.Tensor) and x.shape == old.shape}
-    for value in moved.values():
-        value[sides != 0] = 0
+    by_row = {key: x for key, x in state.items() if isinstance(x, torch.Tensor) and x.shape == old.shape}
     if len(rows) == len(old):
-        old.copy_(old[rows])
-        for key, value in moved.items():
-            state[key].copy_(value)
+        for value in (old, *by_row.values()):
+            value.index_copy_(0, moved, value[rows[moved]])
+        for value in by_row.values():
+            value.index_fill_(0, children, 0)
         return
+    by_row = {key: x[rows] for key, x in by_row.items()}
+    for value in by_row.values():
+        value.index_fill_(0, children, 0)
     new = old[rows]
     if isinstance(old, nn.Parameter):
         new = nn.Parameter(new, old.requires_grad)
         for group in optimizer.param_groups:
             group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
         if optimizer.state.pop(old, None) is not None:
-            optimizer.state[new] = {**state, **moved}
+            optimizer.state[new] = {**state, **by_row}
     setattr(owner, leaf, new)
