@@ -4,9 +4,6 @@ A thread is four neighbouring values of one parameter, on a CPU 1,024, written i
 regulariser is sum_l c_l sum(H_l^2) over the levels of a grid (L, T, F): its gradient is added to what autograd gave.
 Its value, before the step, is written as one sum for each warp, on a CPU for each thread. Neither depends on the order
 of threads.
-
-Where a grid rests, a value whose gradient was 0, nearly always since no hit of the step looked it up, stays as it is
-with its moments, without the regulariser's pull. Moments of neighbours that all rest are not read.
 """
 
 import warp as wp
@@ -37,7 +34,6 @@ class Adam:
     halves: wp.array(dtype=wp.float16)  # of the grid; empty where there is no copy
     factors: Real  # c_l, empty without a regulariser; level l begins at value l << level_bits
     level_bits: wp.int32
-    rests: wp.bool  # of the grid: whether values without a gradient rest
     beta1: wp.float32
     beta2: wp.float32
     rest1: wp.float32  # 1 - beta1
@@ -77,7 +73,6 @@ _STEP = """
     const wp::float32 step = number(steps), rate = number(rates) / rest(log_beta1, step);
     const wp::float32 correction = 1.0f / root(rest(log_beta2, step));
     const bool grid = starts == 0, regularised = grid && factors.shape[0] > 0;
-    const bool all = !(grid && rests);
     const unsigned count = counts;
     wp::float32 losses[WIDE] = {};
     for (unsigned at = first; at < end && at < count; at += WIDE) {
@@ -93,10 +88,10 @@ _STEP = """
             else for (int k = 0; k < WIDE; ++k) if (k < size) to[k] = from[k];
         };
         alignas(16) wp::float32 p[WIDE], g[WIDE] = {}, m[WIDE], v[WIDE];
-        bool moves[WIDE], any = false;
         read(values, p);
+        read(means, m);
+        read(squares, v);
         if (grads) read(grads, g);
-        for (int k = 0; k < WIDE; ++k) any |= moves[k] = all || g[k] != 0.0f;
         if (regularised) {
             for (int k = 0; k < WIDE; ++k) {
                 const wp::float32 pull = k < size ? factors.data[(at + k) >> level_bits] * p[k] : 0.0f;
@@ -104,14 +99,10 @@ _STEP = """
                 losses[k] += pull * p[k];
             }
         }
-        if (!any) continue;
-        read(means, m);
-        read(squares, v);
         for (int k = 0; k < WIDE; ++k) {
-            const wp::float32 mean = beta1 * m[k] + rest1 * g[k], square = beta2 * v[k] + rest2 * g[k] * g[k];
-            m[k] = moves[k] ? mean : m[k];
-            v[k] = moves[k] ? square : v[k];
-            p[k] -= moves[k] ? rate * mean / (root(square) * correction + epsilon) : 0.0f;
+            m[k] = beta1 * m[k] + rest1 * g[k];
+            v[k] = beta2 * v[k] + rest2 * g[k] * g[k];
+            p[k] -= rate * m[k] / (root(v[k]) * correction + epsilon);
         }
         write(values, p);
         write(means, m);

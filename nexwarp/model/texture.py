@@ -176,7 +176,7 @@ class NeuralTexture(Texture):
             hidden_layers: number of hidden layers.
             sh_degree: SH degree of the output, 0 to 3: (sh_degree + 1)^2 coefficients of three channels.
             residual: add the texture's colours to the surfels' plain colours instead of replacing them; where no photo
-                trained the field it adds little, and the plain colours remain.
+                trained the field it is 0, and the plain colours remain.
             down_weighting: down-weight levels whose cells are smaller than a pixel (Delta, paper Eq. 4).
 
         Raises:

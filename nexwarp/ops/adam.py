@@ -34,13 +34,11 @@ def adam_step(
     epsilon: float,
     factors: torch.Tensor | None = None,
     half: torch.Tensor | None = None,
-    rests: bool = False,
 ) -> torch.Tensor | None:
     """Update parameters and their averages in place, as `torch.optim.Adam` does, to float32 rounding.
 
     The first one becomes `half`, too, in float16. With `factors` (L,), it is a grid H (L, T, F) whose T * F is a power
     of two, and the gradient of sum_l factors[l] sum(H_l^2) is added: that sum before the step, a scalar, is returned.
-    Where it `rests`, its values without a gradient of their own and their averages stay as they are.
     """
     if not parameters:
         return None
@@ -63,7 +61,6 @@ def adam_step(
         halves=half,
         factors=factors,
         level_bits=level_bits,
-        rests=rests,
         beta1=betas[0],
         beta2=betas[1],
         rest1=1.0 - betas[0],

@@ -43,7 +43,6 @@ class FusedAdam(torch.optim.Adam):
         self.grid_loss: torch.Tensor | None = None
         self._texture: NeuralTexture | None = None
         self._factors: torch.Tensor | None = None
-        self._rests = False
 
     # Torch wraps these for its compiler, whose import takes 0.6 s; a step of ours is never compiled.
     def add_param_group(self, param_group: ParameterGroup) -> None:
@@ -59,12 +58,12 @@ class FusedAdam(torch.optim.Adam):
         """Drop all gradients, or zero them, as `torch.optim.Adam` does."""
         inspect.unwrap(torch.optim.Adam.zero_grad)(self, set_to_none)
 
-    def regularise(self, texture: NeuralTexture, factors: torch.Tensor | None, *, rests: bool = False) -> None:
+    def regularise(self, texture: NeuralTexture, factors: torch.Tensor | None) -> None:
         """Take over a texture's grid: update its half-precision copy, and add sum_l factors[l] sum(H_l^2) to the loss.
 
-        Of the (L,) `factors`, None adds nothing. `rests` is `Recipe.grid_rests`.
+        Of the (L,) `factors`, None adds nothing.
         """
-        self._texture, self._factors, self._rests = texture, factors, rests
+        self._texture, self._factors = texture, factors
         if texture.grid.is_cuda:
             texture.half_copy()  # before any step is captured
 
@@ -79,7 +78,7 @@ class FusedAdam(torch.optim.Adam):
         if texture is not None and (texture.grid.is_cuda or texture.half_copy_key() is not None):
             half = texture.half_copy()
         stepped: list[Stepped] = []
-        of_first: dict[str, Any] = {}
+        of_first: dict[str, torch.Tensor | None] = {}
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is None and (parameter is not grid or self._factors is None):
@@ -92,7 +91,7 @@ class FusedAdam(torch.optim.Adam):
                 moments = state["exp_avg"], state["exp_avg_sq"]
                 one = Stepped(parameter.detach(), *moments, parameter.grad, state["step"], rate)
                 if parameter is grid:
-                    of_first = {"factors": self._factors, "half": half, "rests": self._rests}
+                    of_first = {"factors": self._factors, "half": half}
                 stepped.insert(0 if parameter is grid else len(stepped), one)
         if stepped:
             torch._foreach_add_([one.step for one in stepped], 1)
@@ -141,8 +140,7 @@ def make_optimizer(
         groups = [group | {"lr": torch.tensor(group["lr"], device=surfels.device)} for group in groups]
     optimizer = FusedAdam(groups, eps=EPSILON)
     if isinstance(texture, NeuralTexture) and config.max_hits:
-        factors = grid_factors(texture, config.losses, cells_unit(scene, config))
-        optimizer.regularise(texture, factors, rests=config.grid_rests)
+        optimizer.regularise(texture, grid_factors(texture, config.losses, cells_unit(scene, config)))
     return optimizer
 
 

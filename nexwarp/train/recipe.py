@@ -208,9 +208,6 @@ class Recipe(Settings):
     least_gamma: float = within(1.5, 1.0)
     """Least gamma of surfels at the end. The bound rises from 1 between 0.3 and 0.8 of the run; sharper surfels overlap
     less, so frames and steps are faster."""
-    grid_rests: bool = True
-    """Let values of the hash grid without a gradient in a step, which no hit looked up, stay as they are. Adam would
-    move them on by their moments, and the grid's loss would pull them to 0."""
     filter_points: bool = True
     """Drop points with short tracks or large reprojection errors before sampling the initial surfels."""
     orient_points: bool = True
@@ -330,7 +327,6 @@ PAPER = Config(
     background=(0.0, 0.0, 0.0),
     depth_jitter=0.0,
     least_gamma=1.0,
-    grid_rests=False,
     footprints=False,
     smooth_sh=0.0,
     exposures=False,
@@ -379,13 +375,7 @@ def preset(name: str) -> Config:
 PARTS = [field.name for field in dataclasses.fields(Config) if dataclasses.is_dataclass(getattr(DEFAULT, field.name))]
 Stored = Mapping[str, Any]  # settings, as `Config.as_dict` of any version returns them
 # What runs did before a setting existed, where the default does something else.
-BEFORE: dict[str, object] = {
-    "skybox": 0,
-    "teachers": 0,
-    "densify.relocate": 0.0,
-    "least_gamma": 1.0,
-    "grid_rests": False,
-}
+BEFORE: dict[str, object] = {"skybox": 0, "teachers": 0, "densify.relocate": 0.0, "least_gamma": 1.0}
 # Settings that no version has any more, and the value with which they did nothing.
 REMOVED: dict[str, object] = {"blur_poses": 1, "coarse": 0.0, "low_pass": False, "losses.distortion": 0.0}
 

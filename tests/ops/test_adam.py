@@ -27,8 +27,7 @@ def make_optimizer(parameters: dict[str, torch.nn.Parameter]) -> FusedAdam:
     return FusedAdam([{"params": [x], "lr": rates[name]} for name, x in parameters.items()], eps=1e-15)
 
 
-@pytest.mark.parametrize("rests", [False, True])
-def test_steps_are_those_of_torch(rests: bool, device: torch.device) -> None:
+def test_steps_are_those_of_torch(device: torch.device) -> None:
     torch.manual_seed(0)
     texture, ours = make_parameters(device)
     torch.manual_seed(0)
@@ -37,24 +36,17 @@ def test_steps_are_those_of_torch(rests: bool, device: torch.device) -> None:
     optimizer = make_optimizer(ours)
     groups = [{"params": [x], "lr": RATES.get(name, 2e-3)} for name, x in theirs.items()]
     reference = torch.optim.Adam(groups, eps=1e-15)
-    optimizer.regularise(texture, grid_factors(texture, WEIGHTS, 2.0), rests=rests)
+    optimizer.regularise(texture, grid_factors(texture, WEIGHTS, 2.0))
     for step in range(30):
-        given = {name: torch.randn_like(parameter) for name, parameter in ours.items()}
-        given["odd"] *= 10.0**-step  # gradients that fade far below the epsilon's square root
-        given["grid"] *= torch.rand_like(texture.grid) > rests / 3  # where it rests, a third has none and 16 in a row
-        given["grid"][:, : 8 * rests] = 0.0
-        for name, grad in given.items():
-            ours[name].grad, theirs[name].grad = grad, grad.double()
+        for name, parameter in ours.items():
+            scale = 10.0 ** (-step if name == "odd" else 0)  # gradients that fade far below the epsilon's square root
+            parameter.grad = scale * torch.randn_like(parameter)
+            theirs[name].grad = parameter.grad.double()
         cells = twin.resolutions.double() * 2.0
         loss = WEIGHTS.grid * (theirs["grid"].square().sum((1, 2)) / cells**3).sum()
-        grid, resting = theirs["grid"], (given["grid"] == 0) & rests
-        grid.grad = torch.where(resting, 0.0, torch.autograd.grad(loss, grid)[0] + given["grid"])
-        held = [grid.detach(), *list(reference.state[grid].values())[1:]]
-        before = [x.clone() for x in held]
+        loss.backward()
         optimizer.step()
         reference.step()
-        for old, new in zip(before, held, strict=True):
-            new.copy_(old.where(resting, new))
         assert optimizer.grid_loss is not None
         assert_close(optimizer.grid_loss, loss, kind="value", name="grid loss")
     for name, parameter in ours.items():

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image
@@ -46,6 +47,7 @@ def test_every_setting_can_be_set_to_what_it_is():
     [
         ("max_resolution=1", "max_resolution: expected a setting, such as texture.max_resolution"),
         ("texture.nope=1", "texture.nope: expected a setting, such as texture."),
+        ("texture.__init__=1", "texture.__init__: expected a setting"),
         ("texture.levels=16.0", "texture.levels: expected an integer, got 16.0"),
         ("texture.residual=1", "texture.residual: expected true or false, got 1"),
         ("texture.max_resolution=NaN", "texture.max_resolution: expected a number or null, got NaN"),
@@ -58,6 +60,7 @@ def test_every_setting_can_be_set_to_what_it_is():
         ("skybox", "expected KEY=VALUE, got 'skybox'"),
         ("max_surfels=15", "max_surfels: expected at least 16, got 15"),
         ("max_hits=9", "max_hits: expected at least 0 and at most 8, got 9"),
+        ("texture.levels=0", "texture.levels: expected at least 1 and at most 64, got 0"),
         ("texture.table_size=1000", "texture.table_size: expected a power of two, got 1000"),
         ("coarse=0.4", "coarse: expected a setting, got one that was removed"),
     ],
@@ -73,8 +76,7 @@ def test_paper_is_the_paper():
     p = preset("paper")
     assert (p.preset, p.iterations, p.max_hits, p.sh_degree, p.sh_every) == ("paper", 30_000, 2, 3, 1000)
     assert (p.max_surfels, p.background, p.more_hits_from, p.mask_mode) == (400_000, (0.0, 0.0, 0.0), 0, "ignore")
-    off = p.filter_points, p.orient_points, p.footprints, p.smooth_sh, p.exposures, p.grid_rests
-    assert not any(off) and p.least_gamma == 1
+    assert not any((p.filter_points, p.orient_points, p.footprints, p.smooth_sh, p.exposures)) and p.least_gamma == 1
     zero = {"depth": 0.0, "depth_maps": 0.0}
     assert p.losses == recipe.LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, **zero)
     constant = {"quats": 1e-3, "scales": 5e-3, "opacities": 0.025, "gammas": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
@@ -103,9 +105,9 @@ def test_runs_from_before_a_setting_keep_what_they_did():
     assert config_from_dict(written) == Config()
     del written["densify"]["relocate"]
     assert config_from_dict(written).densify == dataclasses.replace(recipe.DensifyConfig(), relocate=0.0)
-    del written["skybox"], written["teachers"], written["least_gamma"], written["grid_rests"]
+    del written["skybox"], written["teachers"], written["least_gamma"]
     found = config_from_dict(written)
-    assert (found.skybox, found.teachers, found.least_gamma, found.grid_rests) == (0, 0, 1.0, False)
+    assert (found.skybox, found.teachers, Config().teachers, found.least_gamma) == (0, 0, None, 1.0)
 
 
 @pytest.mark.parametrize("change", [lambda d: d | {"texture": 3}, lambda d: d | {"iterations": "many"}, lambda _: []])
@@ -146,3 +148,10 @@ def test_the_demo_keeps_what_makes_a_preset():
     for name in ("texture.residual", "texture.max_resolution", "losses.depth", "densify.prune_at_cap", "smooth_sh"):
         assert setting(config, name) == setting(paper, name)
     assert dataclasses.replace(train, preset="default")._config().texture.residual
+
+
+def test_a_value_of_another_type_names_its_field() -> None:
+    given: tuple[dict[str, Any], ...] = ({"iterations": "x"}, {"background": (0.0, 1.0)}, {"densify": {}})
+    for changes in given:
+        with pytest.raises(ValueError, match=f"{next(iter(changes))}: expected (an integer|a list of 3|DensifyConfig)"):
+            Config(**changes)

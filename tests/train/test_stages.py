@@ -51,6 +51,7 @@ def settings_of(config: nw.Config, own: OwnTeachers) -> list[nw.Config]:
         ("fast", {}, 21, 7000),  # the shortest
         ("fast", {}, 263, 30_000),  # never longer
         ("fast", {"iterations": 700}, 43, 700),
+        ("fast", {"steps_a_photo": 300}, 43, 12_900),
     ],
 )
 def test_a_fast_run_has_the_iterations_that_its_photos_need(preset, changes, photos, iterations):
@@ -61,14 +62,17 @@ def test_a_fast_run_has_the_iterations_that_its_photos_need(preset, changes, pho
 @pytest.mark.parametrize(
     ("changes", "photos", "count"),
     [
+        ({}, 21, 2),
         ({}, 44, 2),
         ({}, 45, 0),  # photos are many
         ({"max_surfels": 12_600}, 42, 2),
         ({"max_surfels": 12_600}, 43, 0),  # surfels are few for them
+        ({"iterations": 60_000}, 21, 2),
         ({"iterations": 29_999}, 21, 0),  # the run is short
         ({"refine_poses": True}, 21, 0),
         ({"teachers": 0}, 21, 0),
-        ({"teachers": 3, "iterations": 100, "max_surfels": 100}, 500, 3),  # what is asked for
+        ({"teachers": 1}, 500, 1),  # what is asked for
+        ({"teachers": 3, "iterations": 100, "max_surfels": 100}, 21, 3),
     ],
 )
 def test_a_run_has_teachers_where_photos_are_few(changes: dict[str, Any], photos: int, count: int) -> None:

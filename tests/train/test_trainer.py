@@ -129,12 +129,6 @@ def test_surfels_settle_with_two_hits(scene):
         assert nw.Trainer(scene, small(iterations=12, max_hits=hits), "cpu").render_options().max_hits == hits
 
 
-@pytest.mark.parametrize("rests", [False, True])
-def test_grid_values_without_a_gradient_rest_where_asked(scene, rests):
-    still = neural(trained(scene, small(iterations=1, grid_rests=rests)).texture).grid == torch.tensor(0.01)
-    assert still.any() == rests and not still.all()
-
-
 def test_surfels_get_sharper_in_the_middle_of_a_run(scene):
     config, least = small(iterations=40, least_gamma=3.0), dict[int, float]()
     assert [config.least_gamma_at(i) for i in (1, 12, 22, 32, 40)] == pytest.approx([1, 1, 2, 3, 3])
