@@ -210,7 +210,7 @@ class Surfels(nn.Module):
 
     @torch.no_grad()
     def sharpen(self, least_gamma: float) -> None:
-        """Raise gammas below a least one, >= 1, to it, in place."""
+        """Raise gammas that are less than `least_gamma`, 1 or more, to it, in place."""
         if least_gamma > 1:
             self.raw_gammas.clamp_(min=math.log(least_gamma - 1))
 

@@ -74,11 +74,11 @@ STEADY: dict[str, object] = {"densify.fraction": 0.0, "densify.relocate": 0.0}
 
 
 class Form(NamedTuple):
-    """What other renderers draw, for which training goes on: share of the run's iterations, surfels, and settings."""
+    """How training goes on for something that other renderers draw."""
 
-    share: float
+    share: float  # of the run's iterations
     growth: int  # at most so many times the surfels of the run
-    settings: dict[str, object]
+    settings: dict[str, object]  # that differ from the run's
 
 
 FORMS = {
@@ -162,9 +162,9 @@ def export_run(
 ) -> Sequence[Path]:
     """Export a run or a model, and return the files that were written; docs/outputs.md describes them.
 
-    `device` renders and trains; `observe` is called with the name of each of their
-    stages, how many views, blocks or steps of it are done, and of how many; `report` with a line that tells how close
-    a baked file comes to the test photos.
+    `device` renders and trains; `observe` is called with the name of each of their stages, how many views, blocks or
+    steps of it are done, and of how many; `report` with lines for the user, such as how close a baked file comes to the
+    test photos.
     """
     order.check()
     folder = order.out or opened.folder / EXPORT_FOLDER
