@@ -1,6 +1,6 @@
-"""CUDA graphs of frames and of training steps: their launches are captured once and replayed as one.
+"""CUDA graphs of frames, of work on many cameras and of training steps: launches are captured once, replayed as one.
 
-Both launch hundreds of small kernels, which keeps the host busy for longer than the GPU. What differs from one frame to
+All launch hundreds of small kernels, which keeps the host busy for longer than the GPU. What differs from one frame to
 the next (camera, background) or from one step to the next (target, learning rates) is copied into tensors that the
 graph reads. Parameters are read where they are, so that changes in place show at once. Whatever else changes needs
 another graph: the first frame or step after it is launched kernel by kernel, so that all kernels are loaded, and the
@@ -15,7 +15,7 @@ import threading
 import warnings
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
@@ -23,7 +23,7 @@ import torch
 from torch import nn
 
 from nexwarp import ops
-from nexwarp.cameras.camera import StagedCamera
+from nexwarp.cameras.camera import Camera, StagedCamera
 from nexwarp.errors import OutOfMemoryError
 from nexwarp.machine import needed_memory
 from nexwarp.model.options import color_numbers
@@ -39,6 +39,9 @@ CHANCES = 3  # how often to start again without any graph when memory does not s
 MOST_GRAPHS = 4
 MOST_SEEN = 16  # kinds of frames of one model that are remembered to have been launched once
 MOST_POINTS = 2**23  # of one frame, pixels times max(K, 1): larger ones keep the GPU busy anyway
+
+# Work on many cameras: captures at most.
+MOST_CAPTURES = 8
 
 # Steps. Kinds of targets (sizes of photos, with or without a mask) that get graphs; each keeps buffers of its own. A
 # kind that was not used for FORGOTTEN steps makes room for another.
@@ -394,6 +397,41 @@ def _can_capture(device: torch.device, frame: GraphFrame) -> bool:
     if any(x.is_floating_point() and x.dtype != torch.float32 for x in read):
         return False
     return not (capturing(device) or (torch.is_grad_enabled() and any(x.requires_grad for x in read)))
+
+
+def on_each_camera(work: Callable[[Camera], ops.ListCapacity], cameras: Iterable[Camera], device: torch.device) -> None:
+    """Do work on each camera; on a GPU as a CUDA graph, from the second camera of a size on, for a few sizes.
+
+    The work launches the same for all cameras of a size, adds its results to tensors from outside, and returns the
+    capacity of its lists.
+    """
+    stream = torch.cuda.Stream(device) if _enabled and device.type == "cuda" else None
+    graphs: dict[Hashable, tuple[StagedCamera, Captured[ops.ListCapacity]] | None] = {}
+    captures = 0
+    for camera in cameras:
+        size = camera.width, camera.height, camera.near
+        graph = graphs.get(size)
+        if stream is not None and size in graphs and graph is None and captures < MOST_CAPTURES:
+            captures += 1
+            staged = StagedCamera(camera, device)
+            try:
+                graph = staged, Captured(functools.partial(work, staged), stream, None)
+            except (CaptureError, ops.UnknownLengthError) as error:
+                log.debug("cameras are worked on kernel by kernel: %s", error)
+                stream = None
+                graphs.clear()
+        if graph is None:
+            work(camera.to(device))
+        else:
+            graph[0].copy_(camera)
+            graph[1].graph.replay()
+            if not ops.fits(graph[1].result, margin=False):
+                graph = None
+        graphs[size] = graph
+    if captures:
+        graph = None
+        graphs.clear()
+        torch.cuda.empty_cache()  # gives back the graphs' memory
 
 
 # Training steps

@@ -12,8 +12,11 @@ from torch import nn
 
 from nexwarp.cameras.camera import Camera, reduced
 from nexwarp.errors import check_tensors
+from nexwarp.model.graphs import on_each_camera
 from nexwarp.model.model import Model
+from nexwarp.model.render import Frame, draw
 from nexwarp.model.surfels import PARAMETERS, Surfels, axes
+from nexwarp.ops import ListCapacity
 from nexwarp.train.recipe import Config
 
 RELOCATE_EVERY = 10  # rounds: the new surfels have to settle
@@ -69,14 +72,19 @@ class DensityControl:
         """Return the surfels (N,) bool of a model to remove in such a round: those that contribute least to any image.
 
         A surfel's contribution to an image is the sum of its blending weights over the pixels; what counts is the image
-        to which it contributes most. Images are rendered at half the size, each weighing all its pixels alike.
-        `largest` takes the contributions (N,) to these images, and returns the largest of all ranks.
+        to which it contributes most. Images are rendered at half the size, each weighing all its pixels alike, by
+        cameras in the surfels' frame. `largest` takes the contributions (N,) to these images, and returns the largest
+        of all ranks.
         """
-        bare = model.bare()
-        most = torch.zeros_like(bare.surfels.logit_opacities)
-        for camera in cameras:
-            out = bare.render(reduced(camera, max(camera.height // 2, 1)))
-            most = torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1.0 / out.alpha.numel())))
+        most = torch.zeros_like(model.surfels.logit_opacities)
+        background = most.new_zeros(3)
+
+        def add(camera: Camera) -> ListCapacity:
+            out = draw(Frame(model.surfels, None, camera, model.options, background))
+            torch.maximum(most, out.splat_error(torch.full_like(out.alpha, 1.0 / out.alpha.numel())), out=most)
+            return out.intermediates.tiles.room
+
+        on_each_camera(add, (reduced(camera, max(camera.height // 2, 1)) for camera in cameras), most.device)
         most = largest(most)
         chosen = torch.zeros(len(most), dtype=torch.bool, device=most.device)
         chosen[most.argsort(stable=True)[: int(self.config.relocate * len(most))]] = True

@@ -2,6 +2,7 @@ import dataclasses
 import math
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock, patch
 
 import pytest
 import torch
@@ -9,6 +10,8 @@ from torch import nn
 
 import nexwarp as nw
 from nexwarp.cameras.camera import Camera, reduced
+from nexwarp.model.graphs import without_graphs
+from nexwarp.model.render import draw
 from nexwarp.model.surfels import PARAMETERS
 from nexwarp.train import densify
 from nexwarp.train.densify import DensityControl, split_surfels
@@ -318,6 +321,23 @@ def test_what_no_image_shows_goes_first(tiny_scene: nw.Scene) -> None:
     assert most[chosen].mean() < 0.2 * most[~chosen].mean() and not least_contributing(0.0).any()
 
 
+@pytest.mark.cuda
+def test_graphs_measure_the_same(tiny_scene: nw.Scene) -> None:
+    """Of cameras of one size, the first is launched and the second captured; without graphs all are launched."""
+    model = nw.Trainer(tiny_scene, small(iterations=30), "cuda").model()
+    cameras = [view.camera.to("cuda") for view in tiny_scene.train]
+    cameras.append(reduced(cameras[0], cameras[0].height - 4))
+    first, second = (Mock(side_effect=torch.clone) for _ in range(2))
+    control = densifier_of(model.surfels)
+    with patch.object(densify, "draw", wraps=draw) as drawn:
+        control.unneeded(model, cameras, first)
+        assert drawn.call_count == 3 < len(cameras)
+        with without_graphs():
+            control.unneeded(model, cameras, second)
+        assert drawn.call_count == 3 + len(cameras)
+    torch.testing.assert_close(first.call_args.args, second.call_args.args)
+
+
 def test_ranks_share_the_views(tiny_scene: nw.Scene, tmp_path: Path) -> None:
     """Each renders some of them, and all choose what one process would."""
     model = nw.Trainer(tiny_scene, small(iterations=30), "cpu").model()
@@ -330,8 +350,7 @@ def test_ranks_share_the_views(tiny_scene: nw.Scene, tmp_path: Path) -> None:
         return reduced(camera, height)
 
     def work(ranks: Ranks) -> object:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(densify, "reduced", noted)
+        with patch.object(densify, "reduced", noted):
             return control.unneeded(model, cameras[ranks.rank :: ranks.size], ranks.largest).tolist(), len(rendered)
 
     found = run_ranks(3, work, tmp_path)
