@@ -20,13 +20,14 @@ from nexwarp.model.model import Model
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import SOFT, Surfels, axes, turned
 from nexwarp.model.texture import NeuralTexture, Texture, TextureShape
-from nexwarp.train.recipe import Config
+from nexwarp.train.recipe import FEW_PHOTOS, Config
 
 INITIAL_OPACITY = 0.1
 NUMBERS_A_PIXEL = 0.1  # of the hash grid, for each pixel of the training photos
 SKYBOX_SHARE = 6  # at most one initial surfel of so many lies on the sphere
 SAME_SCALE = 1e-3  # relative difference of the scales of one scene
 TABLE_POWERS = (12, 20)  # sizes of tables, as powers of two; the largest is the paper's
+MANY_DOUBLINGS, MANY_POWER = 2, 19  # where photos are many, tables double twice, but not beyond 2^19
 
 
 class Start(TypedDict, total=False):
@@ -175,8 +176,8 @@ def texture_shape(scene: Scene, config: Config) -> TextureShape:
     """Arguments of `NeuralTexture`, with resolutions that follow the scene when the config leaves them open.
 
     The finest level's cells are as small as the pixels of nearly all training views at the points they see (95th
-    percentile of f / t), the coarsest's a 64th of the scene's scale: rescaling a scene changes nothing. The table is as
-    large as the photos can fill: with more numbers than pixels, it learns each photo by heart.
+    percentile of f / t), the coarsest's a 64th of the scene's scale: rescaling a scene changes nothing. A table that
+    is too large for the photos learns each by heart; the fewer there are, the sooner.
     """
     asked = config.texture
     finest = _pixel_resolution(scene) if asked.max_resolution is None else asked.max_resolution
@@ -190,9 +191,11 @@ def texture_shape(scene: Scene, config: Config) -> TextureShape:
 
 
 def _table_size(scene: Scene, width: int) -> int:
-    """Entries of tables of `width` numbers an entry, a power of two, that hold `NUMBERS_A_PIXEL`."""
+    """Entries of tables of `width` numbers an entry, a power of two, of `NUMBERS_A_PIXEL`, more for many photos."""
     pixels = sum(view.camera.width * view.camera.height for view in scene.train)
     power = round(math.log2(NUMBERS_A_PIXEL * pixels / width))
+    if len(scene.train) > FEW_PHOTOS:
+        power = max(power, min(power + MANY_DOUBLINGS, MANY_POWER))
     return 2 ** min(max(power, TABLE_POWERS[0]), TABLE_POWERS[1])
 
 

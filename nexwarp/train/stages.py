@@ -19,7 +19,7 @@ from nexwarp.train.exposure import calibrate_exposures
 from nexwarp.train.initial import Start
 from nexwarp.train.parallel import ParallelTrainer
 from nexwarp.train.ranks.ranks import Ranks
-from nexwarp.train.recipe import REFERENCE_ITERATIONS, Config
+from nexwarp.train.recipe import FEW_PHOTOS, REFERENCE_ITERATIONS, Config
 from nexwarp.train.report import StepReport
 from nexwarp.train.trainer import Trainer
 
@@ -27,7 +27,6 @@ from nexwarp.train.trainer import Trainer
 # a photo or more no scene lost PSNR of validation views on the mean of its pairs; with 46, 77, 115 and 230 photos one
 # scene lost 0.04 to 0.5 dB, and 0.011 of SSIM or more. Fewer than 30,000 steps were not tried at full size.
 TEACHERS = 2
-MOST_PHOTOS = 44
 SURFELS_A_PHOTO = 300
 SHORTEST = 7000  # iterations of a run that is shortened to its photos
 SHARE = 0.4  # of the iterations that the teachers have together
@@ -94,7 +93,7 @@ def plan_teachers(config: Config, photos: int) -> OwnTeachers:
     most = config.max_surfels
     count = config.teachers
     if count is None:
-        few = photos <= MOST_PHOTOS and most >= SURFELS_A_PHOTO * photos
+        few = photos <= FEW_PHOTOS and most >= SURFELS_A_PHOTO * photos
         count = TEACHERS if few and config.iterations >= REFERENCE_ITERATIONS and not config.refine_poses else 0
     if not count:
         return NO_TEACHERS
