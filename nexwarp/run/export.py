@@ -170,7 +170,11 @@ def export_run(
     folder = order.out or opened.folder / EXPORT_FOLDER
     if order.crop and order.format in CARDS:
         opened = _cropped(opened, report)
-    scene = _photos(opened, device, observe) if _learns(opened, order, device, report) else None
+    finetunes = order.finetune and opened.source is not None and order.format in FITTED
+    if finetunes and order.format != "web" and _takes_hours(opened, device):
+        report("the run's own surfels are exported: without its GPU, training them further would take hours")
+    kept = order.format in SPLATS and (_is_cropped(opened) or _takes_hours(opened, device))
+    scene = _photos(opened, device, observe) if finetunes and not kept else None
     files = [*_export(opened, order, folder, scene, device, observe)]
     beside = folder.parent if folder.suffix == ".html" else folder
     if scene is not None and scene.test and order.format in READ:
@@ -186,16 +190,6 @@ def export_run(
         meaning = "world position = origin + exported position"
         write_json(files[-1], {"origin": opened.model.origin, "meaning": meaning})
     return files
-
-
-def _learns(opened: OpenedModel, order: ExportOrder, device: Device, report: Callable[[str], object]) -> bool:
-    """Whether an export learns from the run's photos; say where splats do not because that would take hours."""
-    if not order.finetune or opened.source is None or (order.format in SPLATS and _is_cropped(opened)):
-        return False
-    if order.format in SPLATS and opened.device == "cuda" and torch.device(device).type == "cpu":
-        report("splats are the run's own surfels: without its GPU, training them further would take hours")
-        return False
-    return order.format in FITTED
 
 
 def _cropped(opened: OpenedModel, report: Callable[[str], object]) -> OpenedModel:
@@ -215,6 +209,11 @@ def _cropped(opened: OpenedModel, report: Callable[[str], object]) -> OpenedMode
 def _is_cropped(opened: OpenedModel) -> bool:
     """Whether a run is cropped."""
     return any(edit.name in REGIONS for edit in opened.edits)
+
+
+def _takes_hours(opened: OpenedModel, device: Device) -> bool:
+    """Whether further training takes hours: on a CPU, of a run of a GPU."""
+    return opened.device == "cuda" and torch.device(device).type == "cpu"
 
 
 def _export(
@@ -310,11 +309,13 @@ def _collision(opened: OpenedModel, device: Device, observe: Progress) -> Mesh:
 def _trained_on(opened: OpenedModel, scene: Scene, device: Device, form: str, observe: Progress) -> Model:
     """Train a run on for one of `FORMS`.
 
-    Returns the model unchanged where it is cropped, as the photos then have no loss around its edge, and where cards
-    are made of a texture that cannot be baked. Warns and returns it unchanged where training fails.
+    Returns the model unchanged where it is cropped, as the photos then have no loss around its edge, where training
+    takes hours, and where cards are made of a texture that cannot be baked. Warns and returns it unchanged where
+    training fails.
     """
     before, config = opened.model, opened.config or DEFAULT
-    if _is_cropped(opened) or (form != "Gaussians" and type(before.texture) is not NeuralTexture):
+    unbaked = form != "Gaussians" and type(before.texture) is not NeuralTexture
+    if unbaked or _is_cropped(opened) or _takes_hours(opened, device):
         return before.to(device)
     share, growth, changes = FORMS[form]
     iterations = max(round(share * config.iterations), 1)

@@ -165,6 +165,8 @@ def test_what_others_draw_comes_from_a_model_trained_for_it(form, finished, monk
     with pytest.warns(UserWarning, match=f"not trained for {form} .* whose scale"):
         other = dataclasses.replace(photos, scale=2 * photos.scale)
         assert _trained_on(opened, other, "cpu", form, lambda *_: None) is opened.model
+    of_gpu = dataclasses.replace(opened, device="cuda")
+    assert _trained_on(of_gpu, photos, "cpu", form, lambda *_: None) is of_gpu.model
 
 
 def test_cut_outs_of_a_hardened_model_show_what_it_shows(finished, monkeypatch):

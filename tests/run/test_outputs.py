@@ -238,9 +238,7 @@ def refuses(run: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., None
         (["--scale", "1000"], ["--scale: expected at most 16384 pixels a side, got 64000x48000"]),
         (["--order", "near"], ["--order: expected depth or distance, got 'near'"]),
         (["--exposure", "auto"], ["--exposure: expected photos or mean, got 'auto'"]),
-        (["--scale", "2", "--size", "9x9"], ["--size, --scale: expected at most one"]),
         (["--camera", "cube"], ["--camera: expected pinhole, panorama, fisheye, got"]),
-        (["--fov", "0", "--camera", "fisheye"], ["--fov: expected 1 to 360"]),
         (["--buffers", "--camera", "panorama"], ["--buffers: expected together with --camera pinhole"]),
     ],
 )
