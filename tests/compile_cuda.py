@@ -25,7 +25,6 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "storage": (wp.float16,),
     "dtype": (wp.float32, types(wp.float32).vec3, types(wp.float32).vec4),
     "max_hits": (0, 2),
-    "degree": (3,),
     "features": (2, 8),
     "clamp": (False, True),
     "with_errors": (False, True),
@@ -40,7 +39,7 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "cut": (False, True),
     "backward": (False, True),
 }
-ALL = VALUES | {"max_hits": tuple(range(MAX_HITS + 1)), "degree": (0, 1, 2, 3), "features": (1, 2, 4, 8)}
+ALL = VALUES | {"max_hits": tuple(range(MAX_HITS + 1)), "features": (1, 2, 4, 8)}
 # Their atomics depend on the architecture.
 ATOMIC = ("hashgrid", "fused_scatter")
 

@@ -42,7 +42,7 @@ def constants(**values: int) -> str:
 
 
 # Of a lane's two points, rows g and g + 8 of a tile, the pixels, -1 beyond the image; and the basis functions q, q + 4,
-# q + 8 and q + 12 at a unit direction, see `nexwarp.kernels.sh.basis_function`.
+# q + 8 and q + 12 at a unit direction, see `nexwarp.kernels.sh.basis`.
 _PIXELS = """
     const float* toward = reinterpret_cast<const float*>(directions.data);
     const int across = (width + (1 << shift) - 1) >> shift;

@@ -28,36 +28,36 @@ def plain_colors(
             "position": (position, (3,)),
         }
     )
-    degree = min(degree, round((shN.shape[1] + 1) ** 0.5) - 1)
-    return _PlainColors.apply(*(x.contiguous() for x in (sh0, shN, means, position)), degree)
+    count = min((degree + 1) ** 2, shN.shape[1] + 1)
+    return _PlainColors.apply(*(x.contiguous() for x in (sh0, shN, means, position)), count)
 
 
 class _PlainColors(Op):
     @staticmethod
     def forward(
-        ctx: Context, sh0: torch.Tensor, shN: torch.Tensor, means: torch.Tensor, position: torch.Tensor, degree: int
+        ctx: Context, sh0: torch.Tensor, shN: torch.Tensor, means: torch.Tensor, position: torch.Tensor, count: int
     ) -> torch.Tensor:
         colors = torch.empty_like(means)
-        launch(means, kernels.plain_colors, len(means), [sh0, shN, means, position], [colors], degree=degree)
+        launch(means, kernels.plain_colors, len(means), [count, sh0, shN, means, position], [colors])
         ctx.save_for_backward(shN, means, position, colors)
-        ctx.rest = degree
+        ctx.rest = count
         return colors
 
     @staticmethod
     def backward(ctx: Context, grad_colors: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         shN, means, position, colors = ctx.saved_tensors
         need_sh0, need_shN, need_means, need_position, _ = ctx.needs_input_grad
-        count, degree, seen = len(means), ctx.rest, [means, position, colors, grad_colors.contiguous()]
+        surfels, count, seen = len(means), ctx.rest, [means, position, colors, grad_colors.contiguous()]
         grad_sh0 = grad_shN = grad_means = grad_position = None
         if need_sh0 or need_shN:
-            grad_sh0, grad_shN = shN.new_empty(count, 1, 3), torch.empty_like(shN)
+            grad_sh0, grad_shN = shN.new_empty(surfels, 1, 3), torch.empty_like(shN)
             # Memory is what counts on CUDA, arithmetic on a CPU.
             sharing = 1 if means.device.type == "cpu" else shN.shape[1] + 1
-            inputs, outputs = [sharing, *seen], [grad_sh0, grad_shN]
-            launch(means, kernels.plain_coefficients_backward, count * sharing, inputs, outputs, degree=degree)
+            inputs, outputs = [count, sharing, *seen], [grad_sh0, grad_shN]
+            launch(means, kernels.plain_coefficients_backward, surfels * sharing, inputs, outputs)
         if need_means or need_position:
             grad_means = torch.empty_like(means)
-            launch(means, kernels.plain_rays_backward, count, [shN, *seen], [grad_means], degree=degree)
+            launch(means, kernels.plain_rays_backward, surfels, [count, shN, *seen], [grad_means])
             # A ray is the surfel's centre minus the camera's.
             grad_position = -grad_means.sum(0) if need_position else None
         return grad_sh0, grad_shN, grad_means, grad_position, None

@@ -171,8 +171,8 @@ def _color_arguments(coefficients: torch.Tensor, rays: Rays, count: int) -> tupl
     """The arguments that the kernels of colours along rays begin with, and the names that they depend on."""
     if len(coefficients) not in OUTPUTS:
         raise ValueError(f"weights: expected 3 (d + 1)^2 outputs with d of 0 to 3, got {len(coefficients)}")
-    degree, hits = OUTPUTS.index(len(coefficients)), count // max(len(rays.directions), 1)
-    names = {"storage": STORAGES[coefficients.dtype], "degree": degree, "clamp": rays.clamp}
+    hits = count // max(len(rays.directions), 1)
+    names = {"storage": STORAGES[coefficients.dtype], "clamp": rays.clamp}
     return [coefficients, rays.directions, hits, rays.offset], names
 
 
