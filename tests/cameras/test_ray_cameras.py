@@ -61,8 +61,7 @@ def test_panoramas_show_all_around_and_faces_meet():
 def test_pixels_without_a_ray_show_the_background():
     camera = nw.RayCamera.fisheye(VIEWMAT, torch.tensor([[11.0, 0, 32], [0, 11, 32], [0, 0, 1]]), (0,) * 4, 64, 64)
     model = crowd()
-    blind = camera.rays.norm(dim=-1) == 0
-    assert 0.05 < blind.double().mean() < 0.5
+    assert 0.05 < (camera.rays.norm(dim=-1) == 0).double().mean() < 0.5
     for rays in (camera, dataclasses.replace(camera, rays=torch.zeros(4, 5, 3))):
         out, empty = model.render(rays), rays.rays.norm(dim=-1) == 0
         assert_close(out.image[empty], torch.tensor(BACKGROUND).expand(int(empty.sum()), 3), kind="value", name="image")

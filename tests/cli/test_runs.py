@@ -43,8 +43,7 @@ def test_a_run_holds_what_it_should(trained, scene):
     assert metrics["iterations_per_second"] == pytest.approx(20 / metrics["seconds"])
     for folder in ("test", "compare"):
         assert {f.name for f in (trained / "renders" / folder).iterdir()} == metrics["views"].keys()
-    stray = [f.name for f in trained.rglob("*") if "tmp" in f.name or f.name.startswith(".")]
-    assert not stray
+    assert not [f.name for f in trained.rglob("*") if "tmp" in f.name or f.name.startswith(".")]
 
 
 def test_memory_that_ends_while_finishing_costs_no_training(scene, tmp_path, monkeypatch, capsys):

@@ -52,8 +52,7 @@ def test_commands_name_the_process_that_is_at_work(holder, tmp_path, capsys):
     """Nothing is written, whatever the command; what only reads, or writes files of its own, needs no lock."""
     run, process, _ = holder
     scene = ["train", "demo", "--run", str(run), "--iterations", "2", "--device", "cpu"]
-    before = [f.name for f in run.iterdir()]
-    assert before == ["run.lock"] and cli.main(scene) == 2
+    assert [f.name for f in run.iterdir()] == ["run.lock"] and cli.main(scene) == 2
     line = capsys.readouterr().err
     expected = re.escape(f"nexwarp: error: {run}: expected a run folder that no other process writes to, but process ")
     since = r"since \d{4}-\d\d-\d\d \d\d:\d\d:\d\d[+-]\d\d:\d\d, does; wait until it ends, or give another run folder\n"

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 import nexwarp as nw
-from nexwarp.cameras.camera import Camera, reduced
+from nexwarp.cameras.camera import reduced
 from nexwarp.model.graphs import without_graphs
 from nexwarp.model.render import draw
 from nexwarp.model.surfels import PARAMETERS
@@ -343,15 +343,10 @@ def test_ranks_share_the_views(tiny_scene: nw.Scene, tmp_path: Path) -> None:
     model = nw.Trainer(tiny_scene, small(iterations=30), "cpu").model()
     control = densifier_of(model.surfels, relocate=0.3)
     cameras = [view.camera for view in tiny_scene.train]
-    rendered: list[int] = []
-
-    def noted(camera: Camera, height: int) -> Camera:
-        rendered.append(height)
-        return reduced(camera, height)
 
     def work(ranks: Ranks) -> object:
-        with patch.object(densify, "reduced", noted):
-            return control.unneeded(model, cameras[ranks.rank :: ranks.size], ranks.largest).tolist(), len(rendered)
+        with patch.object(densify, "draw", wraps=draw) as drawn:
+            return control.unneeded(model, cameras[ranks.rank :: ranks.size], ranks.largest).tolist(), drawn.call_count
 
     found = run_ranks(3, work, tmp_path)
     expected = control.unneeded(model, cameras)

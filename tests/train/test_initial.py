@@ -33,10 +33,7 @@ def test_finest_cells_are_the_pixels_of_nearly_all_views(scene):
     [(21e6, 44, 16), (33e7, 44, 20), (1e3, 1, 12), (1e12, 44, 20), (21e6, 45, 18), (82e6, 45, 19), (33e7, 45, 20)],
 )
 def test_the_table_is_as_large_as_the_photos_can_fill(scene, pixels, photos, power):
-    """A tenth of a number for each pixel, 8 levels of 4 numbers an entry, and at most the paper's size.
-
-    From 45 photos on four times as many, unless that is more than half of the paper's size.
-    """
+    """A tenth of a number a pixel, 32 an entry, at most the paper's size; of 45 photos four times, up to half of it."""
     scene = dataclasses.replace(scene, train=[scene.train[0]] * photos)
     each = int(pixels) // photos
     camera = Camera(torch.eye(4), torch.eye(3), 1000, each // 1000) if each >= 1000 else scene.train[0].camera

@@ -46,6 +46,7 @@ def test_every_setting_can_be_set_to_what_it_is():
     ("text", "message"),
     [
         ("max_resolution=1", "max_resolution: expected a setting, such as texture.max_resolution"),
+        ("texture.nope=1", "texture.nope: expected a setting, such as texture."),
         ("texture.__init__=1", "texture.__init__: expected a setting"),
         ("texture.levels=16.0", "texture.levels: expected an integer, got 16.0"),
         ("texture.residual=1", "texture.residual: expected true or false, got 1"),
@@ -55,7 +56,10 @@ def test_every_setting_can_be_set_to_what_it_is():
         ("rates.means=[1e-3]", "rates.means: expected a list of 2 numbers, got [0.001]"),
         ("rates.means=[0.1, 0]", "rates.means: expected rates > 0, or 0 throughout, got (0.1, 0.0)"),
         ("background=[0, 0, 2]", "background: expected at least 0 and at most 1, got 2"),
+        ("densify.every=0", "densify.every: expected at least 1, got 0"),
         ("skybox", "expected KEY=VALUE, got 'skybox'"),
+        ("max_surfels=15", "max_surfels: expected at least 16, got 15"),
+        ("max_hits=9", "max_hits: expected at least 0 and at most 8, got 9"),
         ("texture.levels=0", "texture.levels: expected at least 1 and at most 64, got 0"),
         ("texture.table_size=1000", "texture.table_size: expected a power of two, got 1000"),
         ("coarse=0.4", "coarse: expected a setting, got one that was removed"),
