@@ -2,8 +2,9 @@
 
 A thread is a surfel (plain) or a point (textured). Read: coefficients and directions. Written: colours; backward, the
 gradients of coefficients and directions, which `wp.grad` of the basis gives. Nothing is added up. A colour that was
-clamped to 0 has no gradient. Constants and signs are the field's. Of lower degrees, plain
-colours use the first `count` functions, textured ones as many as have coefficients.
+clamped to 0 has no gradient. Constants and signs are the field's.
+
+Of lower degrees, plain colours use the first `count` functions of the basis, textured ones those with coefficients.
 """
 
 from __future__ import annotations

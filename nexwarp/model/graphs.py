@@ -40,7 +40,7 @@ MOST_GRAPHS = 4
 MOST_SEEN = 16  # kinds of frames of one model that are remembered to have been launched once
 MOST_POINTS = 2**23  # of one frame, pixels times max(K, 1): larger ones keep the GPU busy anyway
 
-# Work on many cameras: captures at most.
+# Work on many cameras: largest number of captures.
 MOST_CAPTURES = 8
 
 # Steps. Kinds of targets (sizes of photos, with or without a mask) that get graphs; each keeps buffers of its own. A

@@ -146,8 +146,8 @@ class TextureConfig(Settings):
     """L, number of resolution levels."""
     table_size: int | None = None
     """T, entries per level, a power of two; None derives it from the training photos: a tenth of a number for each
-    pixel. Of more than 44 photos, tables of less than 2^19 entries get up to four times as many, but no more than that.
-    More entries make sharper pictures, of a lower LPIPS, and larger files."""
+    pixel. More than 44 photos raise it up to four times, but not beyond 2^19. More entries make sharper pictures, of a
+    lower LPIPS, and larger files."""
     features: int = 4
     """F, features per entry."""
     min_resolution: float | None = None
