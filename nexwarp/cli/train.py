@@ -32,7 +32,7 @@ from nexwarp.run.folder import (
     read_run,
     update_run,
 )
-from nexwarp.train.initial import Start, check_start
+from nexwarp.train.initial import Start, check_start, load_kernels
 from nexwarp.train.ranks.ranks import Ranks, check_count, is_rank
 from nexwarp.train.recipe import DEMO_SETTINGS, Config, parse_settings, preset, setting, with_settings
 from nexwarp.train.stages import NO_TEACHERS, StageRunner, plan_teachers, shortened
@@ -123,6 +123,7 @@ class Train:
                 if ranks.first:
                     make_scene(captured, console)
                 ranks.barrier()
+            load_kernels(record.config, ranks.device)
             scene = _load_scene(record, ranks, console)
             with naming("--init"):
                 check_start(scene, record.config, start)

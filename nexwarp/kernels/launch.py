@@ -3,12 +3,13 @@
 A chunk's threads write what no other chunk's do, so that nothing depends on how many chunks there are.
 """
 
+import contextlib
 import ctypes
 import functools
 import os
 import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,8 @@ CHUNKS_A_THREAD = 4
 EVEN_CHUNKS_A_THREAD = 2
 # Handing out a chunk costs as much as some hundred threads of a kernel that does little.
 LIGHT_CHUNK = 4096
+LAUNCH_THREADS = 256  # of a block on a GPU, where a kernel does not need another number
+MOST_LOADERS = 4  # threads that compile: eight were hardly faster, for Warp generates code in one at a time
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,58 @@ def _share(part: Callable[[tuple[int, int]], None], ranges: list[tuple[int, int]
             helper.result()
 
 
+_loading: dict[wp.Module, Future[None]] = {}
+
+
+def load_ahead(kernels: Iterable[tuple[wp.Kernel, int]], device: str) -> None:
+    """Load kernels for launches with so many threads a block, in the background; a launch waits for its own.
+
+    A kernel that cannot be loaded raises when it is launched.
+    """
+    tasks = []
+    for kernel, block_dim in kernels:
+        if kernel.module not in _loading:
+            _loading[kernel.module] = future = Future()
+            tasks.append((kernel.module, block_dim, future))
+    waiting = iter(tasks)
+
+    def work() -> None:
+        for module, block_dim, future in waiting:
+            if not threading.main_thread().is_alive():  # the process ends
+                return
+            if future.set_running_or_notify_cancel():
+                try:
+                    with contextlib.suppress(Exception):
+                        wp.load_module(module=module, device=device, block_dim=None if device == "cpu" else block_dim)
+                finally:
+                    future.set_result(None)
+                    _loading.pop(module, None)
+
+    for _ in range(min(_threads, MOST_LOADERS, len(tasks))):
+        with contextlib.suppress(RuntimeError):  # no more threads: launches load
+            threading.Thread(target=work, name="nexwarp loading").start()
+
+
+def _await_load(module: wp.Module) -> None:
+    """Wait for the thread that loads a module ahead; one that none has begun with is left to the caller."""
+    future = _loading.get(module)
+    if future is not None:
+        if not future.cancel():
+            future.result()
+        _loading.pop(module, None)
+
+
+def _stop_loading() -> None:
+    futures = list(_loading.values())
+    _loading.clear()
+    for future in [future for future in futures if not future.cancel()]:
+        future.result()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(before=_stop_loading)  # what a thread holds would stay held in the child
+
+
 class _Command:
     """A kernel's launch that is made once and done again with other arguments, faster than by `wp.launch`.
 
@@ -93,6 +148,7 @@ class _Command:
         self, kernel: wp.Kernel, shape: tuple[int, ...], values: list[Any], stream: wp.Stream, block_dim: int
     ) -> None:
         self.shape = shape
+        _await_load(kernel.module)
         command: Any = wp.launch(
             kernel, shape, inputs=values, device=stream.device, block_dim=block_dim, record_tape=False, record_cmd=True
         )
@@ -147,7 +203,7 @@ def launch(
     arguments: Sequence[Any],
     stream: wp.Stream | None,
     *,
-    block_dim: int = 256,
+    block_dim: int = LAUNCH_THREADS,
     sharing: Sharing = LIGHT,
 ) -> None:
     """Launch a kernel, whose arguments are `first` and these, over the leading dimension of `dim`.
@@ -160,6 +216,8 @@ def launch(
     if stream is not None:
         _launch_again(kernel, shape, [0, *arguments], stream, block_dim)
         return
+
+    _await_load(kernel.module)
 
     def part(bounds: tuple[int, int]) -> None:
         first, last = bounds

@@ -246,7 +246,7 @@ def launch(
     inputs: Sequence[Argument],
     outputs: Sequence[Argument],
     *,
-    block_dim: int = 256,
+    block_dim: int = launching.LAUNCH_THREADS,
     sharing: launching.Sharing = launching.LIGHT,
     **names: Argument,
 ) -> None:

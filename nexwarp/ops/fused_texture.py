@@ -38,12 +38,21 @@ def fits(grid: torch.Tensor, weights: Sequence[torch.Tensor], points: int) -> bo
     shapes = [tuple(matrix.shape) for matrix in weights]
     hidden: list[tuple[int, ...]] = [(WIDTH, FEATURES), (WIDTH, WIDTH)]
     return (
-        levels * features == FEATURES
-        and features in (2, 4)
+        fits_sizes(levels, features, WIDTH, 2)
         and any(shapes == [*hidden, (3 * (degree + 1) ** 2, WIDTH)] for degree in range(4))
         and levels * size * features <= LARGEST_INT
         and points <= LARGEST_INT // 64
     )
+
+
+def fits_sizes(levels: int, features: int, width: int, hidden_layers: int) -> bool:
+    """Whether the fused kernels take L levels of F features and an MLP of these sizes."""
+    return levels * features == FEATURES and features in (2, 4) and (width, hidden_layers) == (WIDTH, 2)
+
+
+def runs_on(device: torch.device) -> bool:
+    """Whether a device has the instructions of tensor cores that the kernels use."""
+    return device.type == "cuda" and torch.cuda.get_device_capability(device) >= (8, 0)
 
 
 def usable(points: Points, field: Field, rays: Rays) -> bool:
@@ -51,8 +60,7 @@ def usable(points: Points, field: Field, rays: Rays) -> bool:
     positions = points.positions
     return (
         field.half
-        and positions.is_cuda
-        and torch.cuda.get_device_capability(positions.device) >= (8, 0)  # tensor cores' instructions
+        and runs_on(positions.device)
         and positions.dtype == torch.float32
         and not (torch.is_grad_enabled() and rays.directions.requires_grad)
         and not torch.are_deterministic_algorithms_enabled()

@@ -8,7 +8,7 @@ from typing_extensions import Unpack
 from nexwarp.data import Scene
 from nexwarp.errors import check_type
 from nexwarp.model.model import Model
-from nexwarp.train.initial import Start, check_start
+from nexwarp.train.initial import Start, check_start, load_kernels
 from nexwarp.train.losses import OwnLoss
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
@@ -76,6 +76,7 @@ def train(
         for callback in observers:
             callback(report)
 
+    load_kernels(config, device)
     store = StageStore(observe)
     runner = StageRunner(scene, config, device, store, losses=losses, teachers=teachers, **start)
     runner.train()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from nexwarp.kernels.launch import MOST_LOADERS
 from tests.compile_cuda import kernels
 from tests.subprocesses import run_python
 
@@ -32,3 +33,9 @@ def test_kernels_compile_for_cuda(arch: int, choice: str, least: int, tmp_path: 
 def test_no_kernel_is_generated_to_be_hashed() -> None:
     """As Warp does where wp.static holds a loop's number: it took 0.3 s at each start for D-SSIM."""
     assert not [kernel.key for kernel in kernels("usual") if kernel.adj.has_unresolved_static_expressions]
+
+
+def test_a_process_that_ends_compiles_no_more(tmp_path: Path) -> None:
+    ahead = "import nexwarp as nw; from nexwarp.train.initial import load_kernels; load_kernels(nw.Config(), 'cpu')"
+    done = run_python("-c", ahead, WARP_CACHE_PATH=str(tmp_path))
+    assert done.returncode == 0 and 1 <= len([*tmp_path.glob("*/wp_*")]) <= 2 * MOST_LOADERS, done.stderr

@@ -1,13 +1,15 @@
 """Launches on a GPU by commands that are made once: each has its own arguments, and keeps none of them."""
 
 import gc
+import threading
 import weakref
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import torch
 import warp as wp
 
+from nexwarp.kernels.launch import _loading as loading
 from nexwarp.ops._interop import array, launch
 from tests.warp_kernels import scaled_sum
 
@@ -56,3 +58,15 @@ def test_nothing_is_kept(device: torch.device) -> None:
     del a, b
     gc.collect()
     assert [x() for x in kept] == [None, None]
+
+
+def test_a_launch_waits_for_a_load_that_has_begun_and_cancels_another() -> None:
+    begun, waiting = Future[None](), Future[None]()
+    begun.set_running_or_notify_cancel()
+    timer = threading.Timer(0.2, begun.set_result, [None])
+    for future in (waiting, begun):
+        loading[scaled_sum.module] = future
+        if future is begun:
+            timer.start()
+        assert Call(torch.ones(4)).right() and future.done() and scaled_sum.module not in loading
+    assert waiting.cancelled()

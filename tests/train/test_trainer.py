@@ -8,7 +8,9 @@ import pytest
 import torch
 
 import nexwarp as nw
-from nexwarp.train.recipe import DensifyConfig, LearningRates
+from nexwarp.kernels import launch
+from nexwarp.ops import ahead
+from nexwarp.train.recipe import DensifyConfig, LearningRates, TextureConfig
 from tests.narrowing import neural
 from tests.scene_writers import with_exposures
 from tests.tolerances import assert_close, assert_equal
@@ -149,3 +151,19 @@ def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor):
     assert len(runs[1].surfels) == len(runs[0].surfels)
     images = [t.model().render(t.views.cameras[0]).image for t in runs]
     assert_close(images[1], images[0], kind="gradient", name="image")
+
+
+@pytest.mark.usefixtures("small_preset")
+def test_what_is_loaded_ahead_is_what_a_training_launches(scene, device, monkeypatch):
+    launched, listed, plain = {}, {}, launch.launch
+
+    def noted(kernel, *arguments, block_dim=launch.LAUNCH_THREADS, **rest):
+        launched[kernel] = block_dim
+        plain(kernel, *arguments, block_dim=block_dim, **rest)
+
+    monkeypatch.setattr(launch, "launch", noted)
+    monkeypatch.setattr(ahead, "load_ahead", lambda kernels, _: listed.update(kernels))
+    model = nw.train(with_exposures(scene), small(texture=TextureConfig(table_size=2**10)), device=device)
+    with torch.no_grad():
+        model.render(scene.test[0].camera.to(device))
+    assert launched == listed
