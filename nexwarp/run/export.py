@@ -1,5 +1,6 @@
 """Export of run folders to the formats of other programs."""
 
+import math
 import re
 import warnings
 from collections.abc import Callable, Sequence
@@ -329,6 +330,9 @@ def _trained_on(opened: OpenedModel, scene: Scene, device: Device, form: str, ob
         "refine_poses": False,
         "mask_mode": MASK_MODES[0],
     }
+    for name in ("scales", "shN"):  # no large steps again
+        rate = getattr(config.rates, name)
+        settings[f"rates.{name}"] = rate if isinstance(rate, float) else math.sqrt(math.prod(rate))
     config = with_settings(config, settings | changes)
     init = before
     if form == "Gaussians":

@@ -106,28 +106,31 @@ class LossWeights(Settings):
     Counts from 7/30 of the run on; smoother meshes."""
 
 
+Rate = float | tuple[float, float]  # throughout a run, or first and last
+
+
 @dataclass(frozen=True)
 class LearningRates(Settings):
-    """Adam's learning rates; pairs decay log-linearly over the run."""
+    """Adam's learning rates: one throughout the run, or the first and the last of a log-linear decay."""
 
-    means: tuple[float, float] = (1.6e-4, 1.6e-6)
-    """First and last learning rate of the centres, times the scene scale."""
-    quats: float = 1e-3
+    means: Rate = (1.6e-4, 1.6e-6)
+    """Learning rates of the centres, times the scene scale."""
+    quats: Rate = 1e-3
     """Learning rate of the raw quaternions."""
-    scales: float = 5e-3
-    """Learning rate of the logarithms of the scales."""
-    opacities: float = 0.025
+    scales: Rate = (2e-2, 1e-3)
+    """Learning rates of the logarithms of the scales."""
+    opacities: Rate = 0.025
     """Learning rate of the logits of the opacities."""
-    gammas: float = 1e-3
+    gammas: Rate = 1e-3
     """Learning rate of the logarithms of gamma - 1."""
-    sh0: float = 2.5e-3
+    sh0: Rate = 2.5e-3
     """Learning rate of the plain colours' constant SH coefficients."""
-    shN: float = 1.25e-4
-    """Learning rate of the plain colours' other SH coefficients."""
-    grid: tuple[float, float] = (1e-3, 1e-5)
-    """First and last learning rate of the hash grid."""
-    mlp: tuple[float, float] = (1e-3, 1e-3)
-    """First and last learning rate of the MLP."""
+    shN: Rate = (6.25e-4, 6.25e-5)
+    """Learning rates of the plain colours' other SH coefficients."""
+    grid: Rate = (1e-3, 1e-5)
+    """Learning rates of the hash grid."""
+    mlp: Rate = 1e-3
+    """Learning rate of the MLP."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -136,6 +139,8 @@ class LearningRates(Settings):
             ends = value if isinstance(value, tuple) else (value, value)
             if not (min(ends) > 0 or ends == (0.0, 0.0)):
                 raise ValueError(f"{rate.name}: expected rates > 0, or 0 throughout, got {value}")
+            if ends[0] == ends[1]:
+                object.__setattr__(self, rate.name, ends[0])
 
 
 @dataclass(frozen=True)
@@ -341,6 +346,7 @@ PAPER = Config(
         levels=16, table_size=2**20, features=2, min_resolution=16.0, max_resolution=256.0, residual=False
     ),
     losses=LossWeights(depth=0.0, depth_maps=0.0),
+    rates=LearningRates(scales=5e-3, shN=1.25e-4),
     densify=DensifyConfig(prune_at_cap=False, relocate=0.0),
 )
 

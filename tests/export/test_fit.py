@@ -11,7 +11,7 @@ from nexwarp.export.baked_scene import BakedScene
 from nexwarp.export.fit import BETAS, SMALLEST, RestingAdam, fit
 from nexwarp.export.glb import bake_cards, make_cards
 from nexwarp.run.evaluate import psnr
-from nexwarp.train.recipe import TextureConfig
+from nexwarp.train.recipe import LearningRates, TextureConfig
 from tests.tolerances import assert_close
 
 STEPS = 60
@@ -20,7 +20,9 @@ STEPS = 60
 @pytest.fixture(scope="module")
 def model(tiny_scene: nw.Scene) -> nw.Model:
     texture = TextureConfig(levels=4, table_size=2**10, width=16, hidden_layers=1)
-    return nw.train(tiny_scene, nw.Config(iterations=150, max_surfels=400, texture=texture, least_gamma=1.0))
+    rates = LearningRates(scales=5e-3, shN=1.25e-4)
+    config = nw.Config(iterations=150, max_surfels=400, texture=texture, least_gamma=1.0, rates=rates)
+    return nw.train(tiny_scene, config)
 
 
 def quality(scene: BakedScene, model: nw.Model, views: Sequence[nw.View]) -> float:

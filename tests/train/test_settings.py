@@ -53,7 +53,7 @@ def test_every_setting_can_be_set_to_what_it_is():
         ("texture.max_resolution=NaN", "texture.max_resolution: expected a number or null, got NaN"),
         (f"iterations=1{'0' * 4000}", "iterations: expected an integer, got 1000"),
         ("mask_mode=both", "mask_mode: expected one of ignore, background, got 'both'"),
-        ("rates.means=[1e-3]", "rates.means: expected a list of 2 numbers, got [0.001]"),
+        ("rates.means=[1e-3]", "rates.means: expected a number or a list of 2 numbers, got [0.001]"),
         ("rates.means=[0.1, 0]", "rates.means: expected rates > 0, or 0 throughout, got (0.1, 0.0)"),
         ("background=[0, 0, 2]", "background: expected at least 0 and at most 1, got 2"),
         ("densify.every=0", "densify.every: expected at least 1, got 0"),
@@ -80,7 +80,7 @@ def test_paper_is_the_paper():
     zero = {"depth": 0.0, "depth_maps": 0.0}
     assert p.losses == recipe.LossWeights(dssim=0.2, alpha=0.005, texture=0.5, opacity=0.01, grid=0.01, **zero)
     constant = {"quats": 1e-3, "scales": 5e-3, "opacities": 0.025, "gammas": 1e-3, "sh0": 2.5e-3, "shN": 1.25e-4}
-    assert p.rates == recipe.LearningRates(means=(1.6e-4, 1.6e-6), grid=(1e-3, 1e-5), mlp=(1e-3, 1e-3), **constant)
+    assert p.rates == recipe.LearningRates(means=(1.6e-4, 1.6e-6), grid=(1e-3, 1e-5), mlp=1e-3, **constant)
     sizes = {"levels": 16, "table_size": 2**20, "features": 2, "width": 64, "hidden_layers": 2, "sh_degree": None}
     ends = {"min_resolution": 16.0, "max_resolution": 256.0}
     assert dataclasses.asdict(p.texture) == sizes | ends | {"residual": False, "down_weighting": True}

@@ -85,9 +85,9 @@ def test_rates_are_log_linear_between_their_ends(scene):
     trainer.run(lambda _: rates.append([group["lr"] for group in trainer.optimizer.param_groups]))
     assert trainer.optimizer.defaults["eps"] == 1e-15  # the paper's
     r, s = config.rates, scene.scale
-    constant = [r.quats, r.scales, r.opacities, r.gammas, r.sh0, r.shN]
-    assert rates[0] == pytest.approx([1.6e-4 * s, *constant, 1e-3, 1e-3], rel=1e-12)
-    assert rates[-1] == pytest.approx([1.6e-6 * s, *constant, 1e-5, 1e-5], rel=1e-12)
+    constant = [r.opacities, r.gammas, r.sh0]
+    assert rates[0] == pytest.approx([1.6e-4 * s, r.quats, 2e-2, *constant, 6.25e-4, 1e-3, 1e-3], rel=1e-12)
+    assert rates[-1] == pytest.approx([1.6e-6 * s, r.quats, 1e-3, *constant, 6.25e-5, 1e-5, 1e-5], rel=1e-12)
     assert torch.tensor(rates, dtype=torch.float64).log().diff(n=2, dim=0).abs().max() < 1e-9
     for step, row in enumerate(rates):
         assert row[0] == pytest.approx(1.6e-4 * s * 100 ** (-step / 8), rel=1e-9)
