@@ -32,10 +32,10 @@ from nexwarp.run.folder import (
     read_run,
     update_run,
 )
-from nexwarp.train.initial import Start, check_start, load_kernels
+from nexwarp.train.initial import Start, check_start
 from nexwarp.train.ranks.ranks import Ranks, check_count, is_rank
 from nexwarp.train.recipe import DEMO_SETTINGS, Config, parse_settings, preset, setting, with_settings
-from nexwarp.train.stages import NO_TEACHERS, StageRunner, plan_teachers, shortened
+from nexwarp.train.stages import NO_TEACHERS, StageRunner, load_kernels, plan_teachers, shortened
 
 if TYPE_CHECKING:
     from nexwarp.viewer import Viewer

@@ -8,11 +8,11 @@ from typing_extensions import Unpack
 from nexwarp.data import Scene
 from nexwarp.errors import check_type
 from nexwarp.model.model import Model
-from nexwarp.train.initial import Start, check_start, load_kernels
+from nexwarp.train.initial import Start, check_start
 from nexwarp.train.losses import OwnLoss
 from nexwarp.train.recipe import Config
 from nexwarp.train.report import StepReport
-from nexwarp.train.stages import StageRunner, StageStore
+from nexwarp.train.stages import StageRunner, StageStore, load_kernels
 
 Callback = Callable[[StepReport], object]
 

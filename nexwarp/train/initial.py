@@ -20,8 +20,6 @@ from nexwarp.model.model import Model
 from nexwarp.model.poses import PoseCorrections
 from nexwarp.model.surfels import SOFT, Surfels, axes, turned
 from nexwarp.model.texture import NeuralTexture, Texture, TextureShape
-from nexwarp.ops import fused_texture
-from nexwarp.ops.ahead import load_training_kernels
 from nexwarp.train.recipe import FEW_PHOTOS, Config
 
 INITIAL_OPACITY = 0.1
@@ -38,16 +36,6 @@ class Start(TypedDict, total=False):
     surfels: Surfels | None
     init: Model | None
     texture: Texture | type[Texture] | Callable[[Scene, Surfels], Texture] | None
-
-
-def load_kernels(config: Config, device: torch.device | str) -> None:
-    """Begin to load the kernels of a training, which takes seconds where they are not in Warp's cache."""
-    texture = config.texture
-    fused = fused_texture.fits_sizes(texture.levels, texture.features, texture.width, texture.hidden_layers)
-    hits, fixed = config.hits_at(1), config.deterministic
-    load_training_kernels(
-        torch.device(device), max_hits=hits, features=texture.features, fused=fused, deterministic=fixed
-    )
 
 
 def check_start(scene: Scene, config: Config, start: Start) -> None:

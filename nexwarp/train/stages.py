@@ -15,6 +15,8 @@ from nexwarp.data import Scene
 from nexwarp.errors import OutOfMemoryError, SettingError
 from nexwarp.machine import derived_seed
 from nexwarp.model.model import Model
+from nexwarp.ops import fused_texture
+from nexwarp.ops.ahead import load_training_kernels
 from nexwarp.train.exposure import calibrate_exposures
 from nexwarp.train.initial import Start
 from nexwarp.train.parallel import ParallelTrainer
@@ -78,6 +80,18 @@ class Stage:
         """Return what the training and the finishing of its model cost, in training steps."""
         passes = (self.config.smooth_sh > 0) + self.config.footprints
         return self.config.iterations + VIEW_COST * passes * photos
+
+
+def load_kernels(config: Config, device: torch.device | str) -> None:
+    """Begin to load the kernels of a training, which takes seconds where they are not in Warp's cache."""
+    texture = config.texture
+    load_training_kernels(
+        torch.device(device),
+        max_hits=config.hits_at(1),
+        features=texture.features,
+        fused=fused_texture.fits_sizes(texture.levels, texture.features, texture.width, texture.hidden_layers),
+        deterministic=config.deterministic,
+    )
 
 
 def shortened(config: Config, photos: int) -> Config:

@@ -153,7 +153,6 @@ def test_training_does_not_depend_on_the_scale_of_the_scene(scene, factor):
     assert_close(images[1], images[0], kind="gradient", name="image")
 
 
-@pytest.mark.usefixtures("small_preset")
 def test_what_is_loaded_ahead_is_what_a_training_launches(scene, device, monkeypatch):
     launched, listed, plain = {}, {}, launch.launch
 
