@@ -2,6 +2,7 @@ import dataclasses
 import re
 import shutil
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -146,7 +147,10 @@ def test_what_others_draw_comes_from_a_model_trained_for_it(form, finished, monk
     monkeypatch.setitem(FORMS, form, FORMS[form]._replace(share=3))
     opened, calls = open_model(finished), list[tuple[str, int, int]]()
     photos = present(_photos(opened, "cpu", lambda *_: None))
-    model, before = _trained_on(opened, photos, "cpu", form, lambda *call: calls.append(call)), opened.model
+    with patch("nexwarp.run.export.train", wraps=nw.train) as train:
+        model, before = _trained_on(opened, photos, "cpu", form, lambda *call: calls.append(call)), opened.model
+    rates = train.call_args.args[1].rates
+    assert (rates.scales, rates.shN) == pytest.approx((20e-6**0.5, 6.25e-4 * 0.1**0.5))  # the middle of their fall
     if form == "Gaussians":
         before = nw.Model(softened(before.surfels), None, options=before.options)
         assert model.options.max_hits == 0 and model.surfels.gammas.max() < 1.01
