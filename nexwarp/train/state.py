@@ -136,6 +136,15 @@ class TrainingState:
         state: dict[str, Any] = {"iteration": self.iteration, "seconds": self.seconds, "order": list(self.order)}
         return Snapshot({name: x.detach().to("cpu", copy=True) for name, x in tensors.items()}, state)
 
+    def take_table_size(self, snapshot: Snapshot) -> None:
+        """Give the texture as many entries as a snapshot's where settings leave them open: versions derive others."""
+        texture, grid = self.texture, snapshot.tensors.get("texture.grid")
+        if grid is None or type(texture) is not NeuralTexture or self.config.texture.table_size is not None:
+            return
+        if grid.shape[1] != texture.config["table_size"]:
+            self._texture = NeuralTexture(**texture.config | {"table_size": grid.shape[1]}).to(self.device)
+            self.optimizer = self._make_optimizer()
+
     def load_snapshot(self, snapshot: Snapshot) -> None:
         """Return to a snapshot, which stays as it is; ValueError or RuntimeError where it does not fit."""
         tensors, state = {name: x.clone() for name, x in snapshot.tensors.items()}, snapshot.state

@@ -264,6 +264,7 @@ class Trainer(TrainingState):
         """
         snapshot = self._read(Path(run), warn)
         try:
+            self.take_table_size(snapshot)
             check_origin(self.origin, self.config, snapshot.state, extend=extend)
             check_snapshot(snapshot, len(self.views), self.config.iterations)
             self.load_snapshot(snapshot)

@@ -18,7 +18,9 @@ from nexwarp.data.scene import SceneSource
 from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
+from nexwarp.train import initial
 from nexwarp.train.checkpoint import load_checkpoint, save_checkpoint
+from nexwarp.train.recipe import TextureConfig
 from tests.data.inputs.support import edit
 from tests.model.test_bounds import tiny_camera, tiny_model
 from tests.model_file_support import refused, rewrite
@@ -89,6 +91,23 @@ def test_a_checkpoint_with_unknown_keys_and_tensors_restores_the_same(tmp_path: 
     save_checkpoint(tmp_path, tensors, state)
     resumed = nw.Trainer(tiny_scene, config, "cpu")
     resumed.restore(tmp_path)
+    assert_same_state(resumed, done)
+
+
+def test_a_checkpoint_of_a_version_that_derived_another_table_is_resumed(
+    tmp_path: Path, tiny_scene: nw.Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = small(iterations=4, texture=TextureConfig(levels=4, width=16))
+    with monkeypatch.context() as other:
+        other.setattr(initial, "_table_size", lambda *_: 2**9)
+        done = trained(tiny_scene, config)
+        halfway = nw.Trainer(tiny_scene, config, "cpu")
+        halfway.run(until=2)
+        halfway.save(tmp_path)
+    resumed = nw.Trainer(tiny_scene, config, "cpu")
+    assert resumed.texture.state_dict()["grid"].shape[1] == 2**12
+    resumed.restore(tmp_path)
+    resumed.run()
     assert_same_state(resumed, done)
 
 
