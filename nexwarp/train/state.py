@@ -59,6 +59,8 @@ class TrainingState:
         surfels = given_surfels(config, start) or initial_surfels(scene, config, self.generator, colors)
         self._surfels = surfels.to(device)
         self._texture = initial_texture(scene, config, surfels, start).to(device)
+        given = (config.texture.table_size, start.get("init"), start.get("texture"))
+        self._derived_table = all(x is None for x in given)
         self.poses = initial_poses(scene, config, device)
         self.optimizer = self._make_optimizer()
         self.densifier = DensityControl(self.surfels, config)
@@ -137,9 +139,9 @@ class TrainingState:
         return Snapshot({name: x.detach().to("cpu", copy=True) for name, x in tensors.items()}, state)
 
     def take_table_size(self, snapshot: Snapshot) -> None:
-        """Give the texture as many entries as a snapshot's where settings leave them open: versions derive others."""
+        """Give a texture made for the scene as many entries as a snapshot's: other versions derive other numbers."""
         texture, grid = self.texture, snapshot.tensors.get("texture.grid")
-        if grid is None or type(texture) is not NeuralTexture or self.config.texture.table_size is not None:
+        if not self._derived_table or grid is None or type(texture) is not NeuralTexture:
             return
         if grid.shape[1] != texture.config["table_size"]:
             self._texture = NeuralTexture(**texture.config | {"table_size": grid.shape[1]}).to(self.device)

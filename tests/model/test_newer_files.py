@@ -15,6 +15,7 @@ import torch
 import nexwarp as nw
 from nexwarp.cameras.cameras_file import load_cameras, save_cameras
 from nexwarp.data.scene import SceneSource
+from nexwarp.errors import CheckpointError
 from nexwarp.io.json_files import write_json
 from nexwarp.model.model_file import save_model
 from nexwarp.run.folder import RunRecord, create_run, read_metrics, read_run
@@ -24,6 +25,7 @@ from nexwarp.train.recipe import TextureConfig
 from tests.data.inputs.support import edit
 from tests.model.test_bounds import tiny_camera, tiny_model
 from tests.model_file_support import refused, rewrite
+from tests.narrowing import neural
 from tests.scenes import make_camera, random_scene
 from tests.tolerances import assert_equal
 from tests.trainer_support import assert_same_state, small, trained
@@ -109,6 +111,11 @@ def test_a_checkpoint_of_a_version_that_derived_another_table_is_resumed(
     resumed.restore(tmp_path)
     resumed.run()
     assert_same_state(resumed, done)
+    texture = nw.NeuralTexture(**neural(resumed.texture).config | {"table_size": 2**12})
+    own = nw.Trainer(tiny_scene, config, "cpu", texture=texture)  # which is trained in place
+    with pytest.raises(CheckpointError, match="it does not fit"):
+        own.restore(tmp_path)
+    assert own.texture is texture
 
 
 def write_version(kind: str, folder: Path, version: object) -> tuple[Path, Callable[[], object]]:
