@@ -12,7 +12,7 @@ l, divided by that of degree 3. The colours in the training views change little;
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import torch
@@ -22,9 +22,12 @@ from nexwarp.data import View
 from nexwarp.kernels.types import ALPHA_MIN
 from nexwarp.machine import deterministic
 from nexwarp.model.exposures import Exposures
+from nexwarp.model.graphs import on_each_camera
 from nexwarp.model.model import Model
+from nexwarp.model.render import Frame, draw
 from nexwarp.model.surfels import Surfels, harmonics
 from nexwarp.model.texture import NEVER, DetailLimits
+from nexwarp.ops import ListCapacity
 from nexwarp.train.recipe import Config
 
 SOLVED = 2**21  # values of the matrices solved at once, several times
@@ -132,22 +135,34 @@ def seen_directions(
     Of C coefficients there are P = C (C + 1) / 2 pairs i <= j, row by row of a matrix's upper triangle. Both are
     float64: the rounding of sums in float32 would exceed the term of a weak smoothing.
     """
-    bare = model.bare()
-    surfels = bare.surfels
-    count = _count(model)
+    surfels, count = model.surfels, _count(model)
+    step = SOLVED // count**2
+    parts = [slice(start, start + step) for start in range(0, len(surfels), step)]
     row, column = torch.triu_indices(count, count, device=surfels.device).unbind()
     products = torch.zeros(len(surfels), len(row), dtype=torch.float64, device=surfels.device)
     total = products.new_zeros(len(surfels))
-    for number, view in enumerate(views, 1):
-        camera = view.camera.to(surfels.device)
-        out = bare.render(camera)
-        counts = torch.ones_like(out.alpha) if view.mask is None else view.mask.to(out.alpha)
-        weights = out.splat_error(counts).double()
-        for seen in weights.nonzero()[:, 0].split(SOLVED // count**2):
-            basis = harmonics(surfels.means.detach()[seen], camera.position, count).double()
-            products[seen] += weights[seen, None] * basis[:, row] * basis[:, column]
-        total += weights
-        progress(number, len(views))
+    background = surfels.means.new_zeros(3)
+    # Which pixels count in the view at hand, by the size of views: a graph reads them where they are.
+    counted: dict[tuple[int, int], torch.Tensor] = {}
+
+    def cameras() -> Iterator[Camera]:
+        for number, view in enumerate(views, 1):
+            size = view.camera.height, view.camera.width
+            pixels = counted.setdefault(size, background.new_empty(size))
+            pixels.copy_(torch.ones(()) if view.mask is None else view.mask)
+            yield view.camera
+            progress(number, len(views))
+
+    def add(camera: Camera) -> ListCapacity:
+        out = draw(Frame(surfels, None, camera, model.options, background))
+        weights = out.splat_error(counted[camera.height, camera.width]).double()
+        for part in parts:
+            basis = harmonics(surfels.means.detach()[part], camera.position, count).double()
+            products[part] += weights[part, None] * basis[:, row] * basis[:, column]
+        total.add_(weights)
+        return out.intermediates.tiles.room
+
+    on_each_camera(add, cameras(), surfels.device)
     return products, total
 
 
