@@ -103,25 +103,18 @@ class Trainer(TrainingState):
         with torch_threads(self.views.torch_threads(self.config.max_hits)):
             while self.iteration < last:
                 try:
-                    report = self._timed_step(last)
+                    start = time.perf_counter()
+                    report = self.step()
+                    self.noted += [(self.iteration, name, value.detach()) for name, value in report.losses.items()]
                     if report.passed(CHECK_EVERY) or self.iteration >= last:
-                        self.check()
+                        self.check()  # which waits for the GPU
+                    self.seconds += time.perf_counter() - start
                     if observe is not None:
                         observe(report)
                 except (MemoryError, RuntimeError) as error:
                     if (needed := needed_memory(error)) is None:
                         raise
                     raise OutOfMemoryError(oom_message(self, needed, graphs=self.graphs is not None)) from error
-
-    def _timed_step(self, last: int) -> StepReport:
-        """Do a step, count its time, and note its losses for the next check."""
-        start = time.perf_counter()
-        report = self.step()
-        if self.iteration >= last and self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        self.seconds += time.perf_counter() - start
-        self.noted += [(self.iteration, name, value.detach()) for name, value in report.losses.items()]
-        return report
 
     def step(self) -> StepReport:
         """Do one iteration: a view, its rendering, the losses, the optimizer, and density control when it is due."""

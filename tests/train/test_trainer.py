@@ -2,7 +2,9 @@ import dataclasses
 import gc
 import itertools
 import math
+import sys
 import weakref
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -77,6 +79,18 @@ def test_progress_tells_what_happened(scene):
     counts = [p.surfels for p in seen]
     assert all(later == before for i, (before, later) in enumerate(itertools.pairwise(counts)) if i % 3 != 1)
     assert counts[2] == 63 == int(1.05 * counts[0]) and max(counts) <= 120
+
+
+def test_seconds_have_waits_for_the_gpu_but_not_the_observer(scene, monkeypatch):
+    trainer, clock = nw.Trainer(scene, small(), "cpu"), [0.0]
+
+    def passes(seconds: float) -> None:
+        clock[0] += seconds
+
+    monkeypatch.setattr(sys.modules["nexwarp.train.trainer"], "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(trainer, "check", lambda: passes(2.0))  # as on a GPU: steps return before their work is done
+    trainer.run(lambda _: passes(0.5))
+    assert trainer.seconds == 2.0
 
 
 def test_rates_are_log_linear_between_their_ends(scene):
