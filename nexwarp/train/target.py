@@ -302,8 +302,8 @@ class TrainingViews:
         return len(self.photos)
 
     def refined_cameras(self, poses: PoseCorrections | None) -> list[Camera]:
-        """Return the cameras on the device, with the poses as they are corrected; None corrects none."""
-        return self.cameras if poses is None else poses.cameras(self.cameras)
+        """Return the cameras with the poses as they are corrected, on the device; None corrects none, on the CPU."""
+        return [view.camera for view in self.views] if poses is None else poses.cameras(self.cameras)
 
     def refined(self, poses: PoseCorrections | None) -> list[View]:
         """Return the views with these cameras, as finishing and evaluation take them."""
