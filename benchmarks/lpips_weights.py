@@ -79,8 +79,7 @@ def main(file: Path) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.lpips_weights", description="Write the weights of LPIPS as a .safetensors file."
-    )
+    description = "Write the weights that `nexwarp eval --metrics lpips` reads."
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.lpips_weights", description=description)
     parser.add_argument("file", type=Path, nargs="?", default=weights_file(), help="default: %(default)s")
     main(parser.parse_args().file)

@@ -149,7 +149,10 @@ def seen_directions(
         for number, view in enumerate(views, 1):
             size = view.camera.height, view.camera.width
             pixels = counted.setdefault(size, background.new_empty(size))
-            pixels.copy_(torch.ones(()) if view.mask is None else view.mask)
+            if view.mask is None:
+                pixels.fill_(1)  # a copy would wait for the GPU
+            else:
+                pixels.copy_(view.mask)
             yield view.camera
             progress(number, len(views))
 

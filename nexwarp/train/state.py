@@ -39,7 +39,7 @@ class TrainingState:
         noise: random numbers on the device.
         order: indices of the views that are left of the epoch, the next one last.
         iteration: steps done.
-        seconds: that the steps took, in all sessions of the run; observers are not counted.
+        seconds: that the steps and their checks took, in all sessions of the run.
     """
 
     background: tuple[float, float, float]

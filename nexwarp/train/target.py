@@ -302,7 +302,7 @@ class TrainingViews:
         return len(self.photos)
 
     def refined_cameras(self, poses: PoseCorrections | None) -> list[Camera]:
-        """Return the cameras with the poses as they are corrected, on the device; None corrects none, on the CPU."""
+        """Return the cameras as they are given, on the CPU, or with corrected poses, on the device."""
         return [view.camera for view in self.views] if poses is None else poses.cameras(self.cameras)
 
     def refined(self, poses: PoseCorrections | None) -> list[View]:
