@@ -14,8 +14,7 @@ last matrix.
                      which may overwrite the features, and of the matrices, in permuted order, a slot for each block.
                      Four warps of a block share the sums of matrix gradients: each holds a fourth of them and reads
                      all four's activations
-    fused_scatter    gradients of the grid, by atomics, and of positions and depths; a warp is one unit, two threads a
-                     point
+    fused_scatter    gradients of the grid, by atomics, and of positions and depths; a warp takes four units
 """
 
 import functools

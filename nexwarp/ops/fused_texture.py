@@ -171,7 +171,7 @@ def _scatter(
     kernel = fused_scatter_kernel(features)
     for first, end in level_groups(levels, size * features * 4):
         arguments = {**fused, **outputs, "first_level": first, "end_level": end}
-        launch(table, kernel, units * 32, [arguments], [], block_dim=SCATTER_THREADS)
+        launch(table, kernel, -(-units // 4) * 32, [arguments], [], block_dim=SCATTER_THREADS)
     return grad_grid, grad_points
 
 
