@@ -11,6 +11,8 @@ from nexwarp.viewer.world import surface_point
 from tests.export.web.support import CHROMIUM, FLAGS
 from tests.viewer.support import serving, wait_for
 
+WIDTH, HEIGHT = 640, 500  # of the window, whose right the panel hides
+
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
 @pytest.mark.timeout(180)
@@ -22,7 +24,7 @@ def test_in_a_browser(model, monkeypatch):
         api.sync_playwright() as playwright,
     ):
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        page = browser.new_page(viewport={"width": 900, "height": 700})
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.goto(viewer.url)
@@ -47,16 +49,16 @@ def test_in_a_browser(model, monkeypatch):
 
         def stretched(pixels: np.ndarray) -> np.ndarray:
             """A picture at the window's size: close to the surfels the finest one is smaller."""
-            return np.asarray(Image.fromarray(pixels).resize((900, 700), Image.Resampling.BILINEAR))
+            return np.asarray(Image.fromarray(pixels).resize((WIDTH, HEIGHT), Image.Resampling.BILINEAR))
 
         def settled() -> np.ndarray:
             """The picture that the browser shows left of the panel, once it is the finest one of the current view."""
             end = time.monotonic() + 60.0  # a browser may show a picture long after it was sent
             while time.monotonic() < end:
-                file = page.screenshot(clip={"x": 20, "y": 250, "width": 450, "height": 430})
+                file = page.screenshot(clip={"x": 20, "y": 180, "width": 270, "height": 300})
                 shot = np.asarray(Image.open(io.BytesIO(file)).convert("RGB")).astype(int)
                 is_drawn = session.drawn_version == session.version and session.drawn_scale == 1.0
-                if is_drawn and differ(shot, stretched(sent[-1])[250:680, 20:470]) < 1:
+                if is_drawn and differ(shot, stretched(sent[-1])[180:480, 20:290]) < 1:
                     return shot
                 page.wait_for_timeout(100)
             pytest.fail("the browser does not show the last picture sent")
@@ -78,9 +80,9 @@ def test_in_a_browser(model, monkeypatch):
         wait_for(lambda: session.settings.max_hits == 0)
         assert differ(settled(), again) > 1, "the slider changes the picture"
 
-        page.mouse.move(200, 450)
+        page.mouse.move(150, 330)
         page.mouse.down()
-        page.mouse.move(320, 430, steps=5)
+        page.mouse.move(240, 315, steps=5)
         page.mouse.up()
         settled()
         assert session.viewpoint is not None
@@ -90,18 +92,19 @@ def test_in_a_browser(model, monkeypatch):
 
         def is_hit(x: int, y: int) -> bool:
             """Whether a surface is there, and beside it."""
-            around = [((x + shift) / 900, (y + shift) / 700) for shift in (-6, 0, 6)]
+            around = [((x + shift) / WIDTH, (y + shift) / HEIGHT) for shift in (-6, 0, 6)]
             assert session.viewpoint is not None
             return all(surface_point(model, session.viewpoint, place, 0.01) is not None for place in around)
 
-        hits = [(x, y) for y in range(260, 680, 20) for x in range(30, 470, 20) if is_hit(x, y)]
+        hits = [(x, y) for y in range(190, 480, 20) for x in range(30, 290, 20) if is_hit(x, y)]
+        assert len(hits) > 1
         for count, (x, y) in enumerate((hits[0], hits[-1]), 1):
             page.mouse.click(x, y)
             page.get_by_text(f"measured {count}").wait_for()
         assert session.measure is not None
         (camera,) = session.viewpoint.bands(1.0, 0.01, torch.zeros(0, dtype=torch.float64))
         pixels, _ = camera.project(torch.from_numpy(session.measure.points))
-        np.testing.assert_allclose(pixels * 900 / camera.width, (hits[0], hits[-1]), atol=1.5)
+        np.testing.assert_allclose(pixels * WIDTH / camera.width, (hits[0], hits[-1]), atol=1.1)
         page.get_by_role("tab", name="Record").click()
         with page.expect_download() as shot:
             page.get_by_role("button", name="Save screenshot").click()

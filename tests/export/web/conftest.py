@@ -1,3 +1,4 @@
+import contextlib
 import functools
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -30,16 +31,29 @@ def site(model, cameras, tmp_path_factory) -> dict[str, bytes]:
         return support.exported(model, cameras, tmp_path_factory.mktemp("site"), page=Page(title="Two & <three>"))
 
 
-@pytest.fixture
-def open_tab(site) -> Iterator[Callable[..., PageTab]]:
-    """What opens a tab of a browser that has WebGPU or not; of a size, or with further options of a context."""
+@pytest.fixture(scope="module")
+def launch_browser() -> Iterator[Callable[[bool], Any]]:
+    """What launches a browser with WebGPU, or one without, once for the tests of a file."""
     api = pytest.importorskip("playwright.sync_api")
     with api.sync_playwright() as playwright:
 
-        def opened(width: int = 200, height: int = 150, *, webgpu: bool = False, **options: Any) -> PageTab:
+        @functools.cache
+        def launched(webgpu: bool) -> Any:
             flags = [*FLAGS, *(WEBGPU if webgpu else ())]
-            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
-            return PageTab(browser, site, viewport={"width": width, "height": height}, **options)
+            return playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+
+        yield launched
+
+
+@pytest.fixture
+def open_tab(site, launch_browser) -> Iterator[Callable[..., PageTab]]:
+    """What opens a tab of a browser that has WebGPU or not; of a size, or with further options of a context."""
+    with contextlib.ExitStack() as tabs:
+
+        def opened(width: int = 200, height: int = 150, *, webgpu: bool = False, **options: Any) -> PageTab:
+            tab = PageTab(launch_browser(webgpu), site, viewport={"width": width, "height": height}, **options)
+            tabs.callback(tab.context.close)
+            return tab
 
         yield opened
 

@@ -3,6 +3,7 @@
 The reader is written from FORMAT.md, independent of the writer and the page.
 """
 
+import base64
 import io
 import json
 import shutil
@@ -33,6 +34,11 @@ URL = "http://localhost/"  # a secure context
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 DRAWN = "nexwarp.state === 'ready' && nexwarp.frames > 0 && nexwarp.refined === 'full'"
 FINISHED = f"{DRAWN} && !nexwarp.dirty && !nexwarp.drawing && !nexwarp.flight && !nexwarp.pacing.moving"
+# As text: the driver takes a second for as many numbers.
+READ_IMAGE = """nexwarp.renderer.read("image").then(image => {
+    const bytes = Array.from(new Uint8Array(Float32Array.from(image).buffer), byte => String.fromCharCode(byte));
+    return [nexwarp.canvas.height, nexwarp.canvas.width, btoa(bytes.join(""))];
+})"""
 POSE = "[...nexwarp.pose.eye, nexwarp.pose.yaw, nexwarp.pose.pitch, nexwarp.pose.distance]"
 
 
@@ -124,10 +130,8 @@ class PageTab(Tab):
 
     def picture(self) -> np.ndarray:
         """The last frame (H, W, 3) in [0, 1]."""
-        values = self.value(
-            "nexwarp.renderer.read('image').then(x => [[nexwarp.canvas.height, nexwarp.canvas.width], Array.from(x)])"
-        )
-        return np.array(values[1], np.float32).reshape(*values[0], 4)[..., :3]
+        height, width, text = self.value(READ_IMAGE)
+        return np.frombuffer(base64.b64decode(text), np.float32).reshape(height, width, 4)[..., :3]
 
 
 def ring(count: int = 4, width: int = 64, height: int = 48) -> dict[str, nw.Camera]:
