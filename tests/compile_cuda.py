@@ -9,7 +9,7 @@ import itertools
 import json
 import pkgutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -19,24 +19,27 @@ import warp as wp
 import nexwarp.kernels
 from nexwarp.kernels.types import MAX_HITS, PerReal, types
 
-# What the factories in nexwarp.kernels are called with, by the name of their parameters: each of their branches.
-VALUES: dict[str, tuple[Any, ...]] = {
+Values = dict[str, tuple[Any, ...]]
+
+# What the factories in nexwarp.kernels are called with, by the name of their parameters: each of their branches. The
+# first values are those that nested branches need.
+VALUES: Values = {
     "real": (wp.float32,),
     "storage": (wp.float16,),
     "dtype": (wp.float32, types(wp.float32).vec3, types(wp.float32).vec4),
-    "max_hits": (0, 2),
+    "max_hits": (2, 0),
     "features": (2, 8),
     "clamp": (False, True),
-    "with_errors": (False, True),
+    "with_errors": (True, False),
     "fixed_point": (False, True),
     "by_place": (False,),  # True is for CPUs
-    "wide": (False, True),
+    "wide": (True, False),
     "outputs": (64,),
     "inputs": (32,),
     "rectified": (False, True),
     "layers": (1, 4),
-    "cards": (False, True),
-    "cut": (False, True),
+    "cards": (True, False),
+    "cut": (True, False),
     "backward": (False, True),
 }
 ALL = VALUES | {"max_hits": tuple(range(MAX_HITS + 1)), "features": (1, 2, 4, 8)}
@@ -44,34 +47,41 @@ ALL = VALUES | {"max_hits": tuple(range(MAX_HITS + 1)), "features": (1, 2, 4, 8)
 ATOMIC = ("hashgrid", "fused_scatter")
 
 
-def made_by(factory: Any, values: dict[str, tuple[Any, ...]]) -> Iterator[wp.Kernel]:
-    """Yield the kernels that a factory makes of all combinations of values."""
-    names = inspect.signature(factory).parameters
-    for chosen in itertools.product(*(values[name] for name in names)):
-        made = factory(*chosen)
+def combinations(names: Iterable[str], values: Values, every: bool) -> Iterator[dict[str, Any]]:
+    """Yield all combinations of values; or the first of each name, and those that differ from these in one value."""
+    lists = {name: values[name] for name in names}
+    for chosen in itertools.product(*lists.values()):
+        if every or sum(value != all_of[0] for value, all_of in zip(chosen, lists.values(), strict=True)) <= 1:
+            yield dict(zip(lists, chosen, strict=True))
+
+
+def made_by(factory: Any, values: Values, every: bool) -> Iterator[wp.Kernel]:
+    """Yield the kernels that a factory makes."""
+    for chosen in combinations(inspect.signature(factory).parameters, values, every):
+        made = factory(**chosen)
         members = [made] if isinstance(made, wp.Kernel) else vars(made).values()
         yield from (member for member in members if isinstance(member, wp.Kernel))
 
 
 def kernels(choice: str) -> Iterator[wp.Kernel]:
-    """Yield the kernels of the modules of nexwarp.kernels: "all", "usual" (one value a branch), "atomic"."""
+    """Yield the kernels of the modules of nexwarp.kernels: "all", "usual" (each branch once), "atomic"."""
     for info in pkgutil.iter_modules(nexwarp.kernels.__path__):
         if choice == "atomic" and info.name not in ATOMIC:
             continue
         module = importlib.import_module(f"nexwarp.kernels.{info.name}")
-        values = ALL if choice == "all" else VALUES
+        every = choice == "all"
+        values = ALL if every else VALUES
         if info.name.startswith("fused"):
-            values = values | {"features": tuple(n for n in values["features"] if n in (2, 4))}
+            values = values | {"features": (2, 4)}
         for name, member in vars(module).items():
             if getattr(member, "__module__", None) != module.__name__:
                 continue
             if isinstance(member, wp.Kernel):
                 yield member
             elif isinstance(member, PerReal) and member.names is not None:
-                for chosen in itertools.product(*(values[name] for name in member.names)):
-                    yield member(wp.float32, **dict(zip(member.names, chosen, strict=True)))
+                yield from (member(wp.float32, **chosen) for chosen in combinations(member.names, values, every))
             elif name.endswith(("_kernel", "_kernels")):
-                yield from made_by(member, values)
+                yield from made_by(member, values, every)
 
 
 def compile_for(arch: int, chosen: list[wp.Kernel], folder: Path) -> dict[str, int]:

@@ -77,8 +77,10 @@ def test_kernels_are_pure_warp() -> None:
 
 def test_import_is_quick_and_compiles_nothing(tmp_path: Path) -> None:
     program = "import time, torch; start = time.process_time(); import nexwarp; print(time.process_time() - start)"
-    runs = [run_python("-c", program, WARP_CACHE_PATH=str(tmp_path)) for _ in range(3)]
-    seconds = [float(run.stdout.splitlines()[-1]) for run in runs]
+    seconds: list[float] = []
+    while len(seconds) < 3 and not any(taken <= 1.5 for taken in seconds):
+        run = run_python("-c", program, WARP_CACHE_PATH=str(tmp_path))
+        seconds.append(float(run.stdout.splitlines()[-1]))
     assert min(seconds) <= 1.5, f"import nexwarp took {seconds} s beyond import torch"
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
