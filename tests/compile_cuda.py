@@ -48,7 +48,7 @@ ATOMIC = ("hashgrid", "fused_scatter")
 
 
 def combinations(names: Iterable[str], values: Values, every: bool) -> Iterator[dict[str, Any]]:
-    """Yield all combinations of values; or the first of each name, and those that differ from these in one value."""
+    """Yield every combination of values, or those that differ from the first values in at most one name."""
     lists = {name: values[name] for name in names}
     for chosen in itertools.product(*lists.values()):
         if every or sum(value != all_of[0] for value, all_of in zip(chosen, lists.values(), strict=True)) <= 1:

@@ -13,10 +13,10 @@ First each lane looks up the cells of two points. The derivative of the interpol
 <features of corner j, incoming gradient>, the position's gradient is that of the interpolation of the s_j, and the
 depth's is their interpolation times the derivative of the fade.
 
-Then the lanes walk along the 16 points together. A cell's eight corners differ in the parity of their coordinates, so
-that each lane takes the one of its own parity. A lane holds the sums of four rows of the table in shared memory, and
+Then the lanes walk along the 16 points together. The eight corners of a cell have eight different parities of x, y and
+z, and each lane takes the corner of its own parity. It holds the sums of four rows of the table in shared memory, and
 adds a sum to the table when another row needs its place: where pixels are smaller than cells, neighbouring points
-share an atomic. The number of atomics is what limits the kernel.
+share an atomic. The number of atomics limits the kernel.
 """
 
 import functools
@@ -28,7 +28,7 @@ from nexwarp.native import snippet
 from nexwarp.native.mma import PRELUDE
 
 SCATTER_THREADS = 128  # of a block
-SCATTER_BLOCKS = 8  # of a multiprocessor, whose registers suffice for as many
+SCATTER_BLOCKS = 8  # of a multiprocessor at least: a thread gets 64 registers
 ENTRIES = 4  # sums that a lane holds; a power of 2
 
 _PROGRAM = """

@@ -17,8 +17,8 @@ from tests.subprocesses import run_python
 @pytest.mark.parametrize(
     ("arch", "choice", "least"),
     [
-        (80, "atomic", 6),
-        (90, "usual", 60),
+        (80, "atomic", 7),
+        (90, "usual", 70),
         *(pytest.param(arch, "all", 120, marks=pytest.mark.slow) for arch in (80, 90)),
     ],
 )

@@ -34,7 +34,7 @@ URL = "http://localhost/"  # a secure context
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 DRAWN = "nexwarp.state === 'ready' && nexwarp.frames > 0 && nexwarp.refined === 'full'"
 FINISHED = f"{DRAWN} && !nexwarp.dirty && !nexwarp.drawing && !nexwarp.flight && !nexwarp.pacing.moving"
-# As text: the driver takes a second for as many numbers.
+# As text: the driver takes a second for that many numbers.
 READ_IMAGE = """nexwarp.renderer.read("image").then(image => {
     const bytes = Array.from(new Uint8Array(Float32Array.from(image).buffer), byte => String.fromCharCode(byte));
     return [nexwarp.canvas.height, nexwarp.canvas.width, btoa(bytes.join(""))];
